@@ -24,7 +24,7 @@ from csph.networks.config import ModelConfig, TrainConfig, preset
 from csph.networks.model import DepthModel, save_model
 from csph.weights.torch_files import load_torch_file
 from scenes.errors import InputError, require
-from spad.sensor.model import Sensor, sensor_by_name
+from spad.sensor.model import PRESETS, Sensor
 
 NETWORK, LAYER = "backbone_net.", "csph3d_layer."
 TEMPORAL, SPATIAL, FULL = f"{LAYER}Cmat_tdim", f"{LAYER}Cmat_xydim", f"{LAYER}Cmat_txydim"
@@ -56,9 +56,7 @@ def import_checkpoint(path: Path, folder: Path, sensor: Sensor | None = None) ->
         weights = _tensors(contents, path.stat().st_size)
         temporal, spatial = _coding(weights)
         design = _design(temporal, spatial)
-        model = ModelConfig(
-            design=design, network="published", sensor=sensor or sensor_by_name(TRAINED_ON), grid="published"
-        )
+        model = ModelConfig(design=design, network="published", sensor=sensor or PRESETS[TRAINED_ON], grid="published")
         data = {"imported": path.name, "imported_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
         config = preset("paper", model, data=data)
         made = DepthModel(model)
@@ -136,7 +134,7 @@ def _code(temporal: Tensor) -> str:
     codes, bins = temporal.shape
     for name in FIXED_CODES:
         try:
-            fixed = temporal_code(name, codes, bins, sensor_by_name(TRAINED_ON))
+            fixed = temporal_code(name, codes, bins, PRESETS[TRAINED_ON])
         except InputError:  # K does not fit that code
             continue
         if bool(((fixed - temporal).abs() < SAME_CODE).all()):

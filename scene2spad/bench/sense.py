@@ -31,7 +31,7 @@ from spad.detection.laws import first_photon_counts
 from spad.detection.rates import rates_for
 from spad.detection.training_patches import Patch, pack_views, sense_patches
 from spad.formats.rgbd import transient_from_rgbd
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PRESETS, PhotonBudget, Sensor
 
 SIZE = (72, 88)
 Way = TypeVar("Way", str, int)  # what ways are named by
@@ -73,7 +73,7 @@ def run(command: Bench, progress: Progress) -> dict:
     if scenes:
         table = estimators.table(
             scenes,
-            sensor_by_name("reference"),
+            PRESETS["reference"],
             estimators.QUICK_LEVELS if command.quick else estimators.LEVELS,
             seed=command.seed,
             progress=lambda what, fraction: progress(what, 0.3 + 0.7 * fraction),
@@ -141,7 +141,7 @@ def max_deviation(counts: np.ndarray, totals: Totals) -> float:
 
 def against_dense(seed: int, repeats: int) -> list[dict]:
     """Return numpy's Poisson draw of every bin from rates that it is given, beside our draws from the returns."""
-    transient, sensor, rows = relief(*SIZE), sensor_by_name("reference"), []
+    transient, sensor, rows = relief(*SIZE), PRESETS["reference"], []
     for signal, background in BUDGETS:
         budget = PhotonBudget(signal, background)
         everything = slice(0, transient.height * transient.width)
@@ -192,13 +192,13 @@ def first_photons(seed: int, repeats: int) -> list[dict]:
 
 
 def _with_cycles(cycles: int) -> Sensor:
-    reference = sensor_by_name("reference")
+    reference = PRESETS["reference"]
     return replace(reference, exposure_s=cycles * reference.period_s)
 
 
 def training(seed: int, repeats: int) -> dict:
     """Return one batch: 4 patches of 32 x 32 x 1024 at two photon levels, from 64 x 64 transients in memory."""
-    view, sensor, size = relief(64, 64), sensor_by_name("reference"), (PATCH_SIDE, PATCH_SIDE)
+    view, sensor, size = relief(64, 64), PRESETS["reference"], (PATCH_SIDE, PATCH_SIDE)
     packed = pack_views([view] * 4)
     patches = [Patch(i, 8 * i, 30 - 8 * i, *PATCHES[i % 2], seed=(seed, i)) for i in range(4)]
     seconds = alternating({"batch": lambda: sense_patches(packed, sensor, patches, size=size)}, 3 * repeats)

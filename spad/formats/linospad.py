@@ -20,7 +20,7 @@ from scenes.limits import require_memory
 from spad.formats.matfile import Matrix, load_mat, save_mat
 from spad.measurements.histogram import Histogram
 from spad.measurements.timestamps import Timestamps
-from spad.sensor.model import Sensor, sensor_by_name
+from spad.sensor.model import PRESETS, Sensor
 
 BINS = 1536
 COUNTS, IMAGES = "spad_processed_data", "cam_processed_data"
@@ -108,7 +108,7 @@ def capture_histogram(capture: Capture, sensor: Sensor | None = None) -> Histogr
     so that the budget states all of them as background. Raises InputError for counts that are no whole numbers or of
     another number of bins, and images that need more memory than the limit.
     """
-    sensor, side = sensor or sensor_by_name("linospad"), capture.side
+    sensor, side = sensor or PRESETS["linospad"], capture.side
     bins, pixels = capture.counts.shape
     require(bins == sensor.bins, f"capture of {bins} bins, sensor {sensor.name} has {sensor.bins}")
     require_memory(12 * bins * pixels, f"a capture of {pixels} pixels")

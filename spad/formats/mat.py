@@ -26,7 +26,7 @@ from spad.formats.linospad import COUNTS, capture_histogram, frame_of
 from spad.formats.matfile import Matrix, load_mat, save_mat
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_taps
 from spad.measurements.histogram import FOREIGN, Histogram
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PRESETS, PhotonBudget, Sensor
 from spad.sensor.pulse import SampledPulse
 from spad.sensor.template import binned_pulse
 
@@ -241,7 +241,7 @@ def _newer_sensor(contents: Mapping[str, Matrix], bins: int, pulse_file: Path) -
     if not pulse_file.is_file():
         return plain
     taps = read_taps(pulse_file, bins)
-    train = replace(plain, pulse=sensor_by_name("iccv2023-train").pulse)
+    train = replace(plain, pulse=PRESETS["iccv2023-train"].pulse)
     for known, form in ((plain, _centred_taps), (plain, published_taps), (train, _centred_taps)):
         if _same_pulse(taps, form(known)):
             return known
@@ -275,7 +275,7 @@ def _histogram(contents: Mapping[str, Matrix], path: Path) -> Histogram:
     if "bin_size" in contents:
         sensor = _newer_sensor(contents, counts.shape[2], _pulse_file(path, height, width))
     else:
-        preset, bins = sensor_by_name("iccv2023-train"), counts.shape[2]
+        preset, bins = PRESETS["iccv2023-train"], counts.shape[2]
         sensor = replace(preset, bins=bins, period_s=bins * preset.bin_width_s)
     signal, sbr = float(contents["photons"].item()), float(contents["SBR"].item())
     if "mean_background_photons" in contents:

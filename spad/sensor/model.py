@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, did_you_mean, require, require_choice, require_number, require_whole
+from scenes.errors import InputError, require, require_choice, require_number, require_whole
 from scenes.json_types import JsonObject
 from scenes.random_streams import Stream
 from spad.sensor.presets import LINOSPAD_FWHM_S, TRAIN_BIN_WIDTH_S, TRAIN_DARK_COUNTS, TRAIN_PULSE
@@ -265,24 +265,6 @@ PRESETS: dict[str, Sensor] = {
     ),
     "linospad": Sensor(name="linospad", bins=1536, bin_width_s=26e-12, pulse=Pulse(LINOSPAD_FWHM_S / FWHM_PER_SIGMA)),
 }
-
-
-def sensor_by_name(name: str) -> Sensor:
-    """Return the preset of that name, or an InputError that lists the names. `spad.sensor_names` knows those of files,
-    too.
-
-    Examples
-    --------
-    >>> import scene2spad as s2s
-    >>> sensor = s2s.sensor_by_name("reference")
-    >>> sensor.bins, round(sensor.period_s * 1e9), round(sensor.range_m, 2)  # bins, ns, m
-    (1024, 100, 14.99)
-    """
-    require(
-        isinstance(name, str) and name in PRESETS,
-        f"sensor {name!r} is unknown{did_you_mean(str(name), PRESETS)}, expected one of {', '.join(PRESETS)}",
-    )
-    return PRESETS[name]
 
 
 def detector_maps(

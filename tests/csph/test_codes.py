@@ -24,7 +24,8 @@ from csph.layer import CompressiveLayer
 from csph.networks.config import ModelConfig
 from scenes.errors import InputError
 from spad.formats.rgbd import published_taps
-from spad.sensor.model import Pulse, Sensor, sensor_by_name
+from spad.sensor.model import Pulse, Sensor
+from spad.sensor_names import sensor_by_name
 
 REFERENCE = Sensor()
 # mean over image rows of the published training pulse, 16 taps of 80 ps (physics of the ICCV 2023 data set)

@@ -22,7 +22,8 @@ from csph.weights.torch_files import load_torch_file
 from scene2spad.datasets.planes import random_planes
 from scenes.errors import InputError
 from spad.detection.detect import sense
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor_names import sensor_by_name
 
 TRAIN = sensor_by_name("iccv2023-train")
 DESIGNS = (

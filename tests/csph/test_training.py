@@ -26,9 +26,10 @@ from scenes import Camera, InputError
 from scenes.files import ATTRIBUTE
 from spad.detection.detect import sense
 from spad.detection.training_patches import pack_views
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse
 from spad.sensor.template import binned_pulse
+from spad.sensor_names import sensor_by_name
 
 SPEED = 299_792_458.0
 # a small sensor: 64 bins over 6.4 ns, 0.96 m

@@ -19,7 +19,8 @@ from spad.detection.detect import sense
 from spad.formats.depth_map import write_depth
 from spad.formats.rgbd import transient_from_rgbd
 from spad.measurements.histogram import write_histogram
-from spad.sensor.model import PhotonBudget, sensor_by_name
+from spad.sensor.model import PhotonBudget
+from spad.sensor_names import sensor_by_name
 
 MODEL = "learned-256x4x4-128x-s0"
 STUDY_ROOM = Path(__file__).parents[2] / "scene2spad" / "studies"

@@ -22,7 +22,8 @@ from spad.detection.detect import sense
 from spad.formats.linospad import Capture, write_linospad
 from spad.formats.mat import read_mat, write_mat
 from spad.measurements.histogram import Histogram, write_histogram
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor_names import sensor_by_name
 
 
 def refused(capfd, *argv: str) -> str:

@@ -10,7 +10,8 @@ from csph.networks.config import ModelConfig, preset
 from scene2spad.cli import main
 from scene2spad.networks.level_warnings import level_warnings
 from spad.sensor.files import SensorFile, write_sensor
-from spad.sensor.model import Sensor, sensor_by_name
+from spad.sensor.model import Sensor
+from spad.sensor_names import sensor_by_name
 
 PERIOD_S = Sensor().period_s
 

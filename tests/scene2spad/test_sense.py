@@ -26,7 +26,8 @@ from spad.formats.rgbd import transient_from_rgbd
 from spad.measurements.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.budget import Optics
 from spad.sensor.files import SensorFile, write_sensor
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor_names import sensor_by_name
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from scene2spad.cli import main
 from scene2spad.emulation.emulated_chain import by_torch, decode, emulate
 from scene2spad.emulation.program_tables import int8_temporal
 from scenes.errors import InputError
-from spad.sensor.model import sensor_by_name
+from spad.sensor_names import sensor_by_name
 from ultraphase import method
 from ultraphase.catalog import FOLDER, PUBLISHED
 

@@ -24,7 +24,8 @@ from spad.formats.linospad import (
     write_linospad,
 )
 from spad.measurements.timestamps import Timestamps
-from spad.sensor.model import PhotonBudget, sensor_by_name
+from spad.sensor.model import PhotonBudget
+from spad.sensor_names import sensor_by_name
 
 LINOSPAD = sensor_by_name("linospad")
 LAWS = settings(deadline=None, derandomize=True, max_examples=30)

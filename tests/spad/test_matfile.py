@@ -20,8 +20,9 @@ from spad.formats.mat import pile_up_warning, read_mat, write_mat
 from spad.formats.matfile import checked_contents, load_mat, save_mat
 from spad.formats.rgbd import published_taps, transient_from_rgbd
 from spad.measurements.histogram import Histogram
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
+from spad.sensor_names import sensor_by_name
 
 
 def saved(path: Path, compressed: bool = False, **variables) -> Path:

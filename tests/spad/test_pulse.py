@@ -10,10 +10,11 @@ from scipy import integrate, stats
 
 from scenes.errors import InputError
 from spad.estimators.depth import confidence, cramer_rao_m, estimate_depth
-from spad.sensor.model import PRESETS, PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PRESETS, PhotonBudget, Sensor
 from spad.sensor.presets import TRAIN_DARK_COUNTS, TRAIN_PULSE
 from spad.sensor.pulse import Pulse, SampledPulse, convolved, read_pulse
 from spad.sensor.template import binned_pulse, pulse_cdf, pulse_cdf_integral, pulse_density
+from spad.sensor_names import sensor_by_name
 
 WIDTH = Sensor().bin_width_s
 C = 299_792_458.0

@@ -18,7 +18,8 @@ from spad.detection.rates import rates_for
 from spad.formats.mat import read_mat, write_mat
 from spad.formats.rgbd import cosine_of_incidence, from_rgbd, published_from_rgbd, published_taps, transient_from_rgbd
 from spad.sensor.budget import Optics
-from spad.sensor.model import PhotonBudget, Pulse, Sensor, sensor_by_name
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor_names import sensor_by_name
 
 TRAIN = sensor_by_name("iccv2023-train")
 LIGHT = 3e8

@@ -30,7 +30,7 @@ from scenes.library.hard_cases import hard_case
 from spad.detection.detect import sense
 from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
-from spad.sensor.model import PhotonBudget, sensor_by_name
+from spad.sensor.model import PRESETS, PhotonBudget
 
 SMOOTH = RenderSettings(bounces=1, grid=4, direct_tolerance_m=1e-4)
 FINE = RenderSettings(bounces=1, grid=8, direct_tolerance_m=1e-4)
@@ -56,7 +56,7 @@ def _on_sensor(name: str, distance_m: float, seed: int) -> Outcome:
     """Measure the frontal wall, and the counts of the reference sensor: where they lie and how many of them wrapped."""
     outcome = _frontal(name, distance_m, 8 * FLOAT32 * distance_m, seed)
     scene = hard_case(name)
-    transient, sensor, budget = render(scene, SMOOTH, seed=seed), sensor_by_name("reference"), PhotonBudget(50, 0)
+    transient, sensor, budget = render(scene, SMOOTH, seed=seed), PRESETS["reference"], PhotonBudget(50, 0)
     pixels = transient.height * transient.width
     counts, wrapped = expected_counts(transient, sensor, rates_for(transient, sensor, budget), slice(0, pixels))
     expected = wall_on_sensor(scene, sensor, distance_m=distance_m)

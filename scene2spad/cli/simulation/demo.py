@@ -45,7 +45,7 @@ class Demo(Common):
 
 def run(command: Demo, progress: Progress) -> dict:
     """Run the command: scene -> transient -> histogram -> four depth maps -> one figure."""
-    from spad.sensor.model import PhotonBudget, sensor_by_name
+    from spad.sensor.model import PRESETS, PhotonBudget
 
     budget = PhotonBudget(command.signal, command.background)
     check_image("demo", width=command.width, height=command.height)
@@ -65,7 +65,7 @@ def run(command: Demo, progress: Progress) -> dict:
     start = time.perf_counter()
     transient = in_view(render(scene, seed=command.seed, progress=progress))
     rendered = time.perf_counter()
-    sensor = sensor_by_name("reference")
+    sensor = PRESETS["reference"]
     histogram = sense(transient, sensor, budget, seed=command.seed, progress=progress)
     sensed = time.perf_counter()
     depths = {}

@@ -28,7 +28,7 @@ from scenes.progress import Progress
 from spad.detection.detect import sense
 from spad.estimators.depth import histogram_errors
 from spad.measurements.histogram import Histogram
-from spad.sensor.model import PhotonBudget, sensor_by_name
+from spad.sensor.model import PRESETS, PhotonBudget
 from ultraphase import Method, method
 from ultraphase.assembly.isa import encode
 from ultraphase.catalog import PUBLISHED
@@ -48,7 +48,7 @@ def run(command: Study, progress: Progress) -> dict:
     require(out.is_dir() or not out.exists(), f"{out}: is a file, expected a folder for the results")
     for name, size in (("width", command.width), ("height", command.height)):
         require(size > 0 and size % 4 == 0, f"{name} {size}: expected a multiple of 4, as 4 x 4 pixels share a core")
-    budget, sensor = PhotonBudget(command.signal, command.background), sensor_by_name("reference")
+    budget, sensor = PhotonBudget(command.signal, command.background), PRESETS["reference"]
     scene = load_scene(command.scene, seed=command.seed, width=command.width, height=command.height)
     transient = render(scene, seed=command.seed, progress=lambda what, fraction: progress(what, 0.1 * fraction))
     histogram = sense(transient, sensor, budget, seed=command.seed)

@@ -37,7 +37,8 @@ from scenes.progress import Progress
 from spad.detection.detect import sense_timestamps
 from spad.estimators.depth import depth_errors
 from spad.formats.linospad import Capture, capture_of, read_linospad, resampled, resampled_sensor, write_linospad
-from spad.sensor.model import PhotonBudget, Sensor, sensor_by_name
+from spad.sensor.model import PRESETS as SENSORS
+from spad.sensor.model import PhotonBudget, Sensor
 
 log = logging.getLogger("scene2spad")
 
@@ -54,9 +55,9 @@ CODES = {256: ("fourier-4", "gray-4"), 128: ("fourier-8", "gray-8", "coarse-8")}
 def prototype() -> Sensor:
     """Return the `linospad` preset with the prototype's measured pulse and the dark counts of its rows, some of them
     hot."""
-    measured = sensor_by_name("iccv2023-train")
+    measured = SENSORS["iccv2023-train"]
     return replace(
-        sensor_by_name("linospad"),
+        SENSORS["linospad"],
         name="linospad-prototype",
         pulse=measured.pulse,
         dark_count_rate_hz=measured.dark_count_rate_hz,
