@@ -20,7 +20,7 @@ ONE_DEVICE = "a training is on one device: on several, Lightning would take fewe
 
 @dataclass(frozen=True)
 class Hardware:
-    """What a training runs on: processes that draw samples, and Lightning's names of accelerator, device, strategy.
+    """Name what a training runs on: processes that draw samples, and Lightning's accelerator, device and strategy.
 
     Raises InputError for several devices. Lightning deals the batches of an epoch out to them, so that N devices take
     1 / N of the steps, on N times the batch, and are at 1 / N of the learning rate's course when the run ends.

@@ -20,7 +20,7 @@ def test_several_devices_are_refused(devices):
 
 
 def test_a_run_of_other_steps_than_asked_is_no_success(tmp_path, monkeypatch):
-    """What several devices did, here by a loader of half the batches."""
+    """Several devices took fewer steps; here a loader of half the batches does."""
     whole = SetData.train_dataloader
 
     def half(self: SetData) -> DataLoader:

@@ -37,7 +37,7 @@ def examples_of(thing: object, name: str) -> list[doctest.DocTest]:
 
 @functools.cache
 def failures(place: str) -> int:
-    """How many examples of a docstring fail; it runs once, however many names it shows."""
+    """Count the examples of a docstring that fail; it runs once, however many names it shows."""
     return sum(doctest.DocTestRunner().run(one).failed for one in examples_of(named(place), place))
 
 

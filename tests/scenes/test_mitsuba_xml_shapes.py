@@ -227,7 +227,7 @@ def test_a_black_back_that_is_seen_is_noted_once(tmp_path: Path) -> None:
 def test_a_sphere_that_mitsuba_keeps_round_is_noted(
     tmp_path: Path, mitsuba: object, kind: str, steps: str, noted: bool
 ) -> None:
-    """Of all shapes the sphere alone has another box in Mitsuba, where a scale is not the same along all axes."""
+    """The sphere alone has another box in Mitsuba, where a scale is not the same along all axes."""
     path = write(tmp_path, f'<shape type="{kind}"><transform name="to_world">{steps}</transform></shape>')
     scene = load_mitsuba_xml(path)
     points = scene.surfaces[0].vertices
