@@ -220,3 +220,11 @@ def test_a_glb_is_in_metres(tmp_path: Path, size: float, odd: bool) -> None:
     with_scale = load_mesh(path, placing=Placing(bare=True, scale=0.5))
     assert np.ptp(with_scale.surfaces[0].vertices, axis=0).max() == pytest.approx(extent / 2, rel=1e-5)
     assert not any(note.startswith("warning") for note in with_scale.notes)
+
+
+def test_a_model_too_large_for_a_floor_is_refused_by_the_files_name(tmp_path: Path) -> None:
+    path = tmp_path / "planet.glb"
+    trimesh.creation.box((1e6, 1e6, 1e6)).export(path)
+    with pytest.raises(InputError, match=r"planet\.glb: largest extent of 1e\+06 m is beyond the 100000 m"):
+        load_mesh(path)
+    assert load_mesh(path, placing=Placing(scale=1e-6)).surfaces

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 EXTENSIONS = (".obj", ".ply", ".stl", ".glb")
 BACKDROP_ALBEDO = 0.55
 SENSIBLE_EXTENT_M = (0.2, 2.5)  # a model whose largest extent lies in here is taken to be in metres already
+MAX_EXTENT_M = 1e5  # of a model with floor and wall around it, which are many times as large
 METRES_EXTENT_M = (0.05, 50.0)  # beyond it a model whose format is in metres, as glTF is, may have another unit
 UNITS_M = {"mm": 1e-3, "millimet": 1e-3, "cm": 1e-2, "centimet": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
 UNITS_M |= {"in": 0.0254, "ft": 0.3048, "met": 1.0, "m": 1.0}
@@ -203,6 +204,9 @@ def _stand(path: Path, parts: list[Part], notes: list[str], placing: Placing) ->
     if not 0 < extent < math.inf:
         raise InputError(f"{path}: its largest extent is {extent:g}, expected a solid body of finite size")
     scale, warning = _scale(path, extent) if placing.scale is None else (placing.scale, [])
+    if not placing.bare and scale * extent > MAX_EXTENT_M:
+        wide = f"{path}: largest extent of {scale * extent:.4g} m is beyond the {MAX_EXTENT_M:g} m that floor and wall"
+        raise InputError(f"{wide} are put around; --scale says how many metres a unit has")
     size = (
         f"{extent:.4g} m kept" if scale == 1 else f"scaled by {scale:.3g}: {extent:.4g} to {round(scale * extent, 4)} m"
     )
