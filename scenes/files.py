@@ -170,8 +170,8 @@ def read_arrays(path: Path, what: str = "array file", names: Collection[str] | N
             require_memory(2 * sum(entry.file_size for entry in entries), "its arrays")
             for entry in entries:
                 name = entry.filename.removesuffix(".npy")
-                if names is None or name in names:
-                    with archive.open(entry) as file:
+                with archive.open(entry) as file:  # of others, too: where a name is damaged, its two copies differ
+                    if names is None or name in names:
                         found[name] = npy_array(file, entry.file_size)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

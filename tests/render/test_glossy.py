@@ -326,7 +326,8 @@ def test_a_diffuse_surface_reverses_as_it_goes():
 
 
 def test_shares_of_any_ratio_are_one_together():
-    ratio = Float(0, 1e-38, 1e-7, 1, 1e7, 1e30, np.inf, np.nan, -1)
+    # 2e-38 is still a normal number of float32: some processors round those below to 0
+    ratio = Float(0, 2e-38, 1e-7, 1, 1e7, 1e30, np.inf, np.nan, -1)
     camera, laser = camera_share(ratio).numpy(), light_share(ratio).numpy()
     assert np.allclose(camera + laser, 1, atol=1e-6) and np.all(laser >= 0)
     assert laser[1] > 0 and laser[2] == pytest.approx(1e-7, rel=1e-5)
