@@ -100,7 +100,8 @@ def _check_values(depth: np.ndarray, albedo: np.ndarray, ambient: np.ndarray) ->
     least = float(depth.min(initial=0.0, where=depth < 0))
     require(least >= 0, f"RGB-D images: a depth of {least:g} m, expected 0 or more, or none (NaN)")
     seen = np.isfinite(depth) & (depth > 0)
-    require(bool(seen.any()), "RGB-D images: no depth is finite and above 0, nothing is seen")
+    if not seen.any():
+        log.warning("RGB-D images: no depth is finite and above 0, nothing is seen")
     farthest = float(depth.max(where=seen, initial=0.0))
     if farthest > FAR_M:
         log.warning("RGB-D images: depths of up to %.5g m: are they in millimetres? Metres are expected", farthest)
@@ -126,8 +127,8 @@ def transient_from_rgbd(
     image itself; None for surfaces that face the camera. Samples without depth (not finite, or 0) return nothing; a
     pixel with samples more than 50 mm apart, or partly nowhere, is mixed.
     `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes or
-    without numbers, sides that `block` does not divide, negative depth, no depth at all, and albedo or ambient light
-    that is negative or not finite. Depth beyond 1 km, as in millimetres, is warned of. `Transient` has an example.
+    without numbers, sides that `block` does not divide, negative depth, and albedo or ambient light that is
+    negative or not finite. No depth at all, and depth beyond 1 km, as in millimetres, are warned of. `Transient` has an example.
     """
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     block = require_whole(block, "RGB-D images: block")
