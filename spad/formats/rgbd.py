@@ -128,8 +128,7 @@ def transient_from_rgbd(
     pixel with samples more than 50 mm apart, or partly nowhere, is mixed.
     `depth_m` [m], `albedo` and `ambient` [W/(m2 sr nm)] are (H, W). Raises InputError for images of other shapes or
     without numbers, sides that `block` does not divide, negative depth, and albedo or ambient light that is
-    negative or not finite. No depth at all, and depth beyond 1 km, as in millimetres, are warned of. `Transient` has an
-    example.
+    negative or not finite. No depth, and depth beyond 1 km (millimetres?), are warned of. `Transient` has an example.
     """
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     block = require_whole(block, "RGB-D images: block")
