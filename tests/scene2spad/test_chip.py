@@ -191,6 +191,6 @@ def test_compile_from_the_command_line(capfd, tmp_path):
         == 0
     )
     assert main(["ultraphase", "compile", "fourier-256x1x1-128x-s0", "--headroom", "9"]) == 2
-    assert "headroom of 9 bits, expected 0 to 4" in capfd.readouterr().err
+    assert "--headroom 9 is outside 0 to 4" in capfd.readouterr().err
     assert main(["ultraphase", "table", "--headroom", "1"]) == 2 and "for compile" in capfd.readouterr().err
     assert main(["ultraphase", "compile"]) == 2 and "which model?" in capfd.readouterr().err

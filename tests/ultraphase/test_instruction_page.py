@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ultraphase
 from scene2spad.cli import main
 from ultraphase.assembly.assembler import DIRECTIVES
 from ultraphase.assembly.isa import OPS, operands
@@ -44,8 +45,13 @@ def example(tmp_path, monkeypatch):
 
 
 def test_the_commands_of_the_page_run(example, capfd):
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+    exec(code, {})
+    programs = Path(ultraphase.__file__).parent / "programs"
+    for name in re.findall(r"`(\w+\.s)`", PAGE.split("`fourier.s` includes")[1].split(": copy")[0]) + ["fourier.s"]:
+        (example / name).write_text((programs / name).read_text())
     commands = re.findall(r"^    (scene2spad ultraphase .*)$", PAGE, re.M)
-    assert len(commands) == 4
+    assert len(commands) == 5
     for command in commands:
         assert main([*shlex.split(command, comments=True)[1:], "--json"]) == 0, capfd.readouterr().err
 
