@@ -213,7 +213,7 @@ def connect_to_light_vertex(
     to_laser = mi.Vector3f(*(dr.gather(Float, part, point, active) for part in light_vertices.to_laser))
     value *= end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
     active &= value > 0
-    passed, leg = segment(world, si, end.p, active)
+    passed, leg = segment(world, si, end.p, active, spread=False)
     path = leg + dr.gather(Float, light_vertices.path, point, active)
     density = dr.gather(Float, light_vertices.density, point, active) * connections
     _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))

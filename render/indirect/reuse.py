@@ -168,7 +168,7 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
     direction = offset * dr.rsqrt(distance2)
     context = mi.BSDFContext()
     value1, density1 = si1.bsdf().eval_pdf(context, si1, si1.to_local(direction), reusable)
-    passed, leg = segment(world, si1, si2.p, reusable & (value1[0] > 0))
+    passed, leg = segment(world, si1, si2.p, reusable & (value1[0] > 0), spread=False)
     # a suffix is seen from where it came, whatever rounding says
     own = vertex == suffix
     passed = dr.select(own, dr.gather(Float, ends.own_transmission, suffix, reusable), passed)

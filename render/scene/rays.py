@@ -86,15 +86,16 @@ def first_opaque(
         distance = si.t if origin is None else dr.norm(si.p - origin)
         return si, Float(1), distance, distance
     start = ray.o if origin is None else origin
-    return _pass_layers(world, ray, start, active, Float(dr.inf), origin is None)[:4]
+    return _pass_layers(world, ray, start, active, None, origin is None)[:4]
 
 
 @dr.syntax
 def _pass_layers(
-    world: TracedScene, ray: Rays, origin: Vectors, active: Masks, limit: Floats, in_air: bool
+    world: TracedScene, ray: Rays, origin: Vectors, active: Masks, limit: Floats | None, in_air: bool
 ) -> tuple[Array, ...]:
     """Trace `first_opaque` through layers, no farther than `limit`; where nothing stops the ray the paths run to the
-    limit.
+    limit. Behind a layer the ray begins a little beside its line, and is aimed at the end of the limit again: what the
+    point beyond lies on does not stop it.
 
     A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
     ray that starts at a surface may start inside glass: the side of its first interface tells. A ray that meets more
@@ -106,12 +107,15 @@ def _pass_layers(
     shortening = dr.zeros(Float, lanes)
     medium = dr.full(Float, 1 if in_air else 0, lanes)  # index of refraction on the way, 0 = not known yet
     layer = dr.zeros(UInt32, lanes)
-    ray, start = mi.Ray3f(ray), mi.Point3f(origin)
+    ray, start, line = mi.Ray3f(ray), mi.Point3f(origin), mi.Vector3f(ray.d)
+    bounded = limit is not None
+    limit = limit if bounded else Float(dr.inf)
+    end = ray.o + line * (limit - dr.dot(ray.o - start, line)) if bounded else mi.Point3f(0)
     found = dr.zeros(mi.PreliminaryIntersection3f, lanes)
     found.t = dr.full(Float, dr.inf, lanes)
     searching = Bool(active)
     while searching:
-        ray.maxt = limit - dr.dot(ray.o - start, ray.d)
+        ray.maxt = limit - dr.dot(ray.o - start, line)
         # rays from the camera are neighbours of each other: told so, Embree is faster
         found = world.mi_scene.ray_intersect_preliminary(ray, coherent=in_air, active=searching)
         hit = searching & found.is_valid()
@@ -131,19 +135,21 @@ def _pass_layers(
         if dr.hint(world.has_cutouts, mode="scalar"):
             passing |= hit & ~glass & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
         # measured from the start: every new ray begins a little off the surface
-        reached = dr.select(passing, dr.dot(si.p - start, ray.d), distance)
+        reached = dr.select(passing, dr.dot(si.p - start, line), distance)
         optical += (reached - distance) * dr.maximum(medium, 1)
         shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
         distance = reached
         medium = dr.select(interface, dr.select(medium == 1, solid, 1), medium)
-        ray.o = dr.select(passing, spawn(si, ray.d).o, ray.o)
+        ray.o = dr.select(passing, spawn(si, line).o, ray.o)
+        if dr.hint(bounded, mode="scalar"):
+            ray.d = dr.select(passing, dr.normalize(end - ray.o), ray.d)
         layer += 1
         searching = passing & (layer < MAX_LAYERS)
         lost = passing & ~searching
         found.t = dr.select(lost, dr.inf, found.t)
         transmission = dr.select(lost, 0, transmission)
     si = found.compute_surface_interaction(ray, mi.RayFlags.All, active & found.is_valid())
-    reached = dr.select(si.is_valid(), dr.dot(si.p - start, ray.d), limit)
+    reached = dr.select(si.is_valid(), dr.dot(si.p - start, line), limit)
     optical += (reached - distance) * dr.maximum(medium, 1)
     shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
     return si, transmission, optical, reached, shortening
@@ -247,9 +253,13 @@ def segment(
         length = dr.norm(way)
         ray = mi.Ray3f(ray.o, way / length, length * (1 - mi.math.ShadowEpsilon), 0, mi.Color0f())
         return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), distance
-    short = distance * (1 - 1e-4)  # not as far as a surface that the point may lie on
-    ray = spawn(si, (point - si.p) / distance)
-    transmission, optical, shortening = passage(world, ray, si.p, short, active, in_air=False)
+    ray = spawn(si, point - si.p)
+    way = point - ray.o
+    length = dr.norm(way)
+    # not as far as a surface that the point may lie on, nor as what a ray from there would miss
+    short = length - dr.maximum(1e-4 * length, mi.math.RayEpsilon * dr.max(dr.abs(point)))
+    ray.d = way / length
+    transmission, optical, shortening = passage(world, ray, ray.o, short, active, in_air=False)
     factor = spreading(distance, shortening) if spread else 1
     return transmission * factor, optical + (distance - short)
 
