@@ -29,7 +29,7 @@ from csph.codes.quantise import (
     straight_through,
     wrapped_sums,
 )
-from csph.codes.temporal import circle_of, orthogonal_start, temporal_code, uniform_start
+from csph.codes.temporal import circle_of, orthogonal_start, spatial_seed, temporal_code, uniform_start
 from csph.codes.tensor import CodingTensor, as_tensor, full_tensor
 from csph.layer_options import STARTS, LayerOptions, SpatialStart, check_switches
 from scenes.errors import require, require_choice, require_kind, require_whole
@@ -58,9 +58,8 @@ def make_coding(
         temporal = uniform_start((codes, bins), bins, seed)
     else:
         temporal = temporal_code(design.code, codes, bins, sensor or Sensor())
-    # a seed of its own: the two factors must not be slices of one stream
     start = orthogonal_start if spatial_start == "orthogonal" else uniform_start
-    spatial = start((codes, rows, columns), rows * columns, seed + (1 << 32)) if design.has_spatial else None
+    spatial = start((codes, rows, columns), rows * columns, spatial_seed(seed)) if design.has_spatial else None
     return CodingTensor(design.name, temporal, spatial, computed=design.computed)
 
 

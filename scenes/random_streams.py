@@ -30,6 +30,7 @@ class Stream(IntEnum):
     PUBLISHED = 35
     WINDOW = 36
     DEVICE_PATCH = 37
+    SPATIAL_CODES = 38
     CLUTTER = 40
 
     # given away twice

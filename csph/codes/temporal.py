@@ -27,6 +27,7 @@ from torch import Tensor
 
 from csph.codes.waves import Rows, truncated_waves, waves
 from scenes.errors import InputError, did_you_mean, require
+from scenes.random_streams import Stream
 from spad.formats.rgbd import published_taps
 from spad.sensor.model import Sensor
 from spad.sensor.template import binned_pulse
@@ -34,7 +35,7 @@ from spad.sensor.template import binned_pulse
 FIXED_CODES = ("fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published")
 GROUPS = 64  # of neighbouring time bins that `grouped_energy` tells apart
 BAND_LIMIT = 0.2  # of the pulse's spectrum at harmonic 1: what Gray Fourier keeps
-MAX_SEED = (1 << 63) - 1  # torch's generators take a bit more, and spatial codes begin 2^32 further on
+MAX_SEED = (1 << 63) - 1  # torch's generators take a bit more
 
 
 def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 0) -> Tensor:
@@ -136,8 +137,19 @@ def walsh_hadamard(codes: int, bins: int) -> Tensor:
     return (1 - 2 * parity).float()
 
 
+def spatial_seed(seed: int) -> int:
+    """Return the seed of the spatial codes that begin beside temporal codes of `seed`, of 32 bits: torch's generator
+    on CPUs takes no more of a seed, so that seeds further apart can be the same one."""
+    _require_seed(seed)
+    return int(np.random.SeedSequence(seed, spawn_key=(Stream.SPATIAL_CODES,)).generate_state(1)[0])
+
+
+def _require_seed(seed: int) -> None:
+    require(0 <= seed <= MAX_SEED, f"seed {seed} is outside 0 to {MAX_SEED}")
+
+
 def _generator(seed: int) -> torch.Generator:
-    require(0 <= seed <= MAX_SEED + (1 << 32), f"seed {seed} is outside 0 to {MAX_SEED}")
+    _require_seed(seed)
     return torch.Generator().manual_seed(seed)
 
 

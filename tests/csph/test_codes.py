@@ -20,7 +20,7 @@ from csph.codes.temporal import (
     walsh_hadamard,
 )
 from csph.codes.tensor import CodingTensor, encode
-from csph.layer import CompressiveLayer
+from csph.layer import CompressiveLayer, make_coding
 from csph.networks.config import ModelConfig
 from scenes.errors import InputError
 from spad.formats.rgbd import published_taps
@@ -144,6 +144,14 @@ def test_random_codes_follow_their_seed_and_range():
     # 8192 draws: the largest is within 1 % of the limit but for a chance of e^-41 a side
     assert 0.99 / 32 < one.abs().max() <= 1 / 32
     assert abs(one.mean()) < 5 / 32 / math.sqrt(3 * one.numel())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_learned_codes_in_space_and_in_time_begin_independently(seed):
+    coding = make_coding(Design("learned", (256, 4, 4), 32), seed=seed)
+    in_space = coding.spatial.flatten()
+    in_time = coding.temporal.flatten()[: in_space.numel()]
+    assert abs(np.corrcoef(in_space, in_time)[0, 1]) < 4 / math.sqrt(in_space.numel())
 
 
 @pytest.mark.parametrize(
