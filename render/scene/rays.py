@@ -93,9 +93,7 @@ def first_opaque(
 def _pass_layers(
     world: TracedScene, ray: Rays, origin: Vectors, active: Masks, limit: Floats | None, in_air: bool
 ) -> tuple[Array, ...]:
-    """Trace `first_opaque` through layers, no farther than `limit`; where nothing stops the ray the paths run to the
-    limit. Behind a layer the ray begins a little beside its line, and is aimed at the end of the limit again: what the
-    point beyond lies on does not stop it.
+    """Trace `first_opaque` through layers, no farther than `limit`; where nothing stops the ray the paths run there.
 
     A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
     ray that starts at a surface may start inside glass: the side of its first interface tells. A ray that meets more
@@ -108,9 +106,8 @@ def _pass_layers(
     medium = dr.full(Float, 1 if in_air else 0, lanes)  # index of refraction on the way, 0 = not known yet
     layer = dr.zeros(UInt32, lanes)
     ray, start, line = mi.Ray3f(ray), mi.Point3f(origin), mi.Vector3f(ray.d)
-    bounded = limit is not None
-    limit = limit if bounded else Float(dr.inf)
-    end = ray.o + line * (limit - dr.dot(ray.o - start, line)) if bounded else mi.Point3f(0)
+    limit, bounded = (Float(dr.inf), False) if limit is None else (limit, True)
+    end = start + line * limit if bounded else start
     found = dr.zeros(mi.PreliminaryIntersection3f, lanes)
     found.t = dr.full(Float, dr.inf, lanes)
     searching = Bool(active)
@@ -141,7 +138,7 @@ def _pass_layers(
         distance = reached
         medium = dr.select(interface, dr.select(medium == 1, solid, 1), medium)
         ray.o = dr.select(passing, spawn(si, line).o, ray.o)
-        if dr.hint(bounded, mode="scalar"):
+        if dr.hint(bounded, mode="scalar"):  # it begins beside its line: so what the end lies on does not stop it
             ray.d = dr.select(passing, dr.normalize(end - ray.o), ray.d)
         layer += 1
         searching = passing & (layer < MAX_LAYERS)
