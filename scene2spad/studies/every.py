@@ -1,4 +1,4 @@
-"""Run a study by its name, or all of them one after the other; the seconds of each go to a journal beside results."""
+"""Run a study by its name, or all of them one after the other; seconds and a record of each lie beside its results."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ import importlib
 import json
 import logging
 import time
-from dataclasses import asdict, replace
-from importlib.metadata import version
+from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
+from types import ModuleType
 
-from scene2spad.options.experiments import ABLATIONS, NO_PRESET, STUDIES, Study
+from scene2spad.options.experiments import ABLATIONS, NO_PRESET, OPTIONS_OF, STUDIES, Study
+from scene2spad.studies.records import asked_of, last_record, write_record
 from scenes.errors import InputError
 from scenes.files import append_line
-from scenes.io.inputs import read_whole_lines
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
@@ -22,7 +21,6 @@ log = logging.getLogger("scene2spad")
 
 TIMINGS = "timings.jsonl"
 ALL = "all"
-JOURNAL = "study-all.jsonl"
 SMOKE_MARK = "smoke run: toy size or trained for seconds"
 
 
@@ -33,17 +31,22 @@ def run(command: Study, progress: Progress) -> dict:
     return run_one(command, progress)
 
 
-def run_one(command: Study, progress: Progress) -> dict:
-    """Run the study of the command's name, whose module is imported now; its seconds are appended to TIMINGS."""
-    name = "ablations" if command.name in ABLATIONS else command.name.replace("-", "_")
-    room = f"scene2spad.studies.{name}"
+def module_of(name: str) -> ModuleType:
+    """Return the module of a study, imported now."""
+    room = f"scene2spad.studies.{'ablations' if name in ABLATIONS else name.replace('-', '_')}"
     spec = find_spec(room)
-    module = room if spec is None or spec.submodule_search_locations is None else f"{room}.study"
+    return importlib.import_module(room if spec is None or spec.submodule_search_locations is None else f"{room}.study")
+
+
+def run_one(command: Study, progress: Progress) -> dict:
+    """Run the study of the command's name; its record is written, and its seconds are appended to TIMINGS."""
     start = time.perf_counter()
     from scene2spad.plots.style import marked  # with matplotlib, which a dry run does without
 
-    with marked(mark_of(command)):
-        result = importlib.import_module(module).run(command, progress)
+    mark = mark_of(command)
+    with marked(mark):
+        result = module_of(command.name).run(command, progress)
+    write_record(command, result, smoke=bool(mark))
     took = {"study": command.name, "preset": command.preset, "seconds": round(time.perf_counter() - start, 3)}
     append_line(command.out / TIMINGS, json.dumps(took))
     return result
@@ -58,8 +61,9 @@ def mark_of(command: Study) -> str:
 def run_all(command: Study, progress: Progress) -> dict:
     """Run every study with the same options; the data of some may be absent.
 
-    Studies that came to their end with these options are not run again, as long as their figures are there. Returns a
-    table of all: done, done before, or left out and why. Raises InputError where not one could be run.
+    A study whose last run here came to its end with these options is not run again, as long as its files are as it
+    wrote them, and nothing is to be shipped. Returns a table of all: done, done before, or left out and why. Raises
+    InputError where not one could be run.
     """
     rows: list[JsonObject] = []
     for number, name in enumerate(STUDIES):
@@ -85,28 +89,19 @@ def _attempt(command: Study, progress: Progress) -> dict:
         log.warning("study %s: left out, %s", command.name, why)
         return {"study": command.name, "status": "left out", "seconds": time.perf_counter() - start, "why": why}
     figures = [str(path) for path in result.get("figures", [])]
-    append_line(command.out / JOURNAL, json.dumps({"asked": _asked(command), "figures": figures}))
     seconds = time.perf_counter() - start
     return {"study": command.name, "status": "done", "seconds": seconds, "figures": figures}
 
 
-def _asked(command: Study) -> str:
-    """All that decides a study's results, but for what it finds in folders."""
-    options = asdict(replace(command, json=False, dry_run=False, ship=False))
-    if not command.pdf:  # older journals do not name it
-        del options["pdf"]
-    return json.dumps({**options, "version": version("scene2spad")}, sort_keys=True, default=str)
-
-
 def _finished(command: Study) -> dict | None:
     """Return the row of a study that has been run with these options; None where it is to be run."""
-    asked = _asked(command)
-    for line in read_whole_lines(command.out / JOURNAL):
-        match line:
-            case {"asked": str(known), "figures": [*figures]} if known == asked:
-                if all(Path(str(path)).is_file() for path in figures):
-                    return {"study": command.name, "status": "done before", "seconds": 0.0, "figures": figures}
-    return None
+    if command.ship and command.name in OPTIONS_OF["ship"]:
+        return None  # no record tells what was put into the package
+    known = last_record(command)
+    if known is None or known.asked != asked_of(command) or len(known.intact(command.out)) < len(known.files):
+        return None
+    figures = [str(command.out / name) for name in known.files if name.endswith(".png")]
+    return {"study": command.name, "status": "done before", "seconds": 0.0, "figures": figures}
 
 
 def _part(progress: Progress, name: str, number: int) -> Progress:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,7 +16,7 @@ from scene2spad.dry_runs.rendering import (
     peak_of_render,
     trial_sizes,
 )
-from scene2spad.options.experiments import STUDIES, Study
+from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study
 from scene2spad.studies import every
 from scenes.errors import InputError
 
@@ -168,16 +169,19 @@ def studies(monkeypatch, tmp_path):
     """Studies that only note that they were run; one lacks its data."""
     calls = []
 
-    def run_one(command, progress):
+    def run(command, progress):
         calls.append(command.name)
         if command.name == "sim-to-real":
             raise InputError("captures:\n not found")
         command.out.mkdir(exist_ok=True)
-        figure = command.out / f"{command.name}.png"
-        figure.write_bytes(b"x")
-        return {"figures": [str(figure)]}
+        paths = {"figures": command.out / f"{command.name}.png", "csv": command.out / f"{command.name}.csv"}
+        if command.seed == 2:  # a run without a table
+            del paths["csv"]
+        for path in paths.values():
+            path.write_text(f"seed {command.seed}")
+        return {key: [str(path)] for key, path in paths.items()}
 
-    monkeypatch.setattr(every, "run_one", run_one)
+    monkeypatch.setattr(every, "module_of", lambda name: SimpleNamespace(run=run))
     return calls
 
 
@@ -197,6 +201,35 @@ def test_all_studies_go_on_past_one_without_data(capfd, folder, studies):
     studies.clear()
     answer(capfd, "study", "all", "--out", "out", "--preset", "smoke", "--seed", "1")
     assert studies == list(STUDIES)
+
+
+def test_a_study_is_done_only_while_its_files_are_as_it_wrote_them(capfd, folder, studies):
+    """Another run into the same folder overwrote them, or a table was deleted or changed: no row says done before."""
+    asked = ("study", "all", "--out", "out")
+    answer(capfd, *asked)
+    answer(capfd, "study", "transport", "--out", "out", "--seed", "1")
+    (folder / "out/chip.csv").unlink()
+    (folder / "out/tdc.csv").write_text("mine")
+    studies.clear()
+    answer(capfd, *asked)
+    assert studies == [name for name in STUDIES if name in ("chip", "transport", "sim-to-real", "tdc")]
+    assert (folder / "out/transport.csv").read_text() == "seed 0"
+    studies.clear()
+    answer(capfd, *asked, "--ship")
+    assert {*OPTIONS_OF["ship"]} <= {*studies} and "chip" not in studies
+
+
+def test_what_a_run_does_not_make_again_goes_and_what_was_changed_stays(capfd, folder, studies):
+    for name in ("chip", "tdc", "tensors"):
+        answer(capfd, "study", name, "--out", "out")
+    (folder / "out/tdc.csv").write_text("mine")
+    for name in ("chip", "tdc", "tensors"):
+        answer(capfd, "study", name, "--out", "out", "--seed", "2")
+    # sheets of `study tensors` are named by what is drawn: they stand beside each other
+    assert {path.name for path in (folder / "out").glob("*.csv")} == {"tdc.csv", "tensors.csv"}
+    (folder / "out/chip.run.json").write_text("{")
+    assert main(["study", "all", "--out", "out", "--seed", "2"]) == 0
+    assert "chip.run.json" in capfd.readouterr().err and "chip" in studies
 
 
 def test_all_studies_are_interrupted_between_two(folder, studies, monkeypatch):

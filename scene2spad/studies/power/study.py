@@ -66,8 +66,11 @@ def run(command: Study, progress: Progress) -> dict:
     found = designs(models.found)
     front = front_rows(found, transient, command.seed, progress)
     losses, print_points = loss_rows(found, command.seed, progress), printed_rows()
-    write_csv(front, out / "ultraphase-front.csv")
-    write_csv(losses, out / "ultraphase-lost.csv")
+    made = [
+        out / "ultraphase.csv",
+        write_csv(front, out / "ultraphase-front.csv"),
+        write_csv(losses, out / "ultraphase-lost.csv"),
+    ]
     drawn = [
         draw_front(found, front, losses, print_points, out / "ultraphase-front.png"),
         draw_power(costs, out / "ultraphase-power.png"),
@@ -85,6 +88,7 @@ def run(command: Study, progress: Progress) -> dict:
         "spatial_weights": SPATIAL,
         "readings": READINGS,
         "figures": [str(path) for path in drawn],
+        "csv": [str(path) for path in made],
         "out": str(out),
     }
 

@@ -127,7 +127,8 @@ def run(command: Study, progress: Progress) -> dict:
     drawn.append(figures.draw_clouds(views, [*methods], depths, f"Point clouds. {note}", command.out / "clouds.png"))
     # given captures know no preset; `report` sets those of `smoke` apart
     kept = {"preset": None if command.capture else command.preset, "note": note, "figures": [p.name for p in drawn]}
-    with whole_file(command.out / "real-data.json") as beside:
+    path = command.out / "real-data.json"
+    with whole_file(path) as beside:
         beside.write_text(json.dumps(finite({**kept, "rows": rows}), indent=1, allow_nan=False) + "\n")
     return {
         "note": note,
@@ -135,7 +136,8 @@ def run(command: Study, progress: Progress) -> dict:
         "table": figures.lines(rows),
         "rows": rows if command.json else len(rows),
         "csv": str(table),
-        "figures": [str(path) for path in drawn],
+        "figures": [str(one) for one in drawn],
+        "numbers": str(path),
     }
 
 
