@@ -54,7 +54,8 @@ def run_one(command: Study, progress: Progress) -> dict:
 
 def mark_of(command: Study) -> str:
     """Return what is written across figures of a smoke run; nothing on those that the preset does not change."""
-    toy = command.preset == "smoke" and command.name not in NO_PRESET and not command.capture
+    given = command.name == "real-data" and command.capture  # `study all` gives captures to every study
+    toy = command.preset == "smoke" and command.name not in NO_PRESET and not given
     return SMOKE_MARK if toy else ""
 
 

@@ -35,3 +35,9 @@ def test_absent_models_are_named(tmp_path, caplog):
 ])  # fmt: skip
 def test_figures_of_smoke_runs_are_marked(name, preset, marked):
     assert mark_of(Study(name=name, preset=preset)) == (SMOKE_MARK if marked else "")
+
+
+def test_captures_that_are_given_unmark_the_study_of_captures_alone():
+    """`study all` gives them to every study."""
+    marks = {name: mark_of(Study(name=name, preset="smoke", capture=("a.mat",))) for name in ("real-data", "chip")}
+    assert marks == {"real-data": "", "chip": SMOKE_MARK}
