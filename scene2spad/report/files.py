@@ -14,7 +14,8 @@ from typing import TypeVar
 
 from PIL import Image, UnidentifiedImageError
 
-from scenes.errors import printable, require
+from scene2spad.studies.records import ENDING, read_record
+from scenes.errors import InputError, printable, require
 from scenes.io.inputs import read_json_object
 
 # What studies keep for themselves: renders, sets, captures, kept results, trained models.
@@ -89,25 +90,28 @@ def gather(root: Path) -> Found:
     """Return all pictures, tables and configurations in a folder. Raises InputError where there is none."""
     require(root.is_dir(), f"{root}: no folder of results; benches and studies fill one")
     files: dict[str, list[Path]] = {}
+    records: list[Path] = []
     configurations: dict[str, list[Path]] = {name: [] for name in CONFIGURATIONS}
     for path in sorted(path for path in root.rglob("*") if path.is_file()):
         inside = path.relative_to(root).parts[:-1]
         if path.name in configurations:
             configurations[path.name].append(path)
+        elif path.name.endswith(ENDING):
+            records.append(path)
         elif path.suffix in ENDINGS and not path.name.startswith(".") and not {*inside} & {*INSIDE}:
             files.setdefault(path.name, []).append(path)
-    smoke = smoke_results(files)
+    smoke = smoke_results(files, records)
     kept = {name: [path for path in paths if path not in smoke] for name, paths in files.items()}
     for paths in kept.values():
         paths.sort(key=lambda path: (-path.stat().st_mtime, path))
     return Found(root, {name: paths for name, paths in kept.items() if paths}, sorted(smoke), configurations)
 
 
-def smoke_results(files: Mapping[str, Sequence[Path]]) -> set[Path]:
-    """Return the files of every study that ran at toy size: its JSON says so, its files bear its name beside it, or are
-    among the figures that it names."""
+def smoke_results(files: Mapping[str, Sequence[Path]], records: Sequence[Path]) -> set[Path]:
+    """Return the files of every study that ran at toy size: its record or its JSON says so, its files bear its name
+    beside it, or are among those that either names."""
     every = [path for paths in files.values() for path in paths]
-    found = set()
+    found = {record.with_name(name) for record in records for name in _smoke_files(record)} & {*every}
     for numbers in (path for path in every if path.suffix == ".json"):
         figures = _smoke_figures(numbers)
         if figures is not None:
@@ -115,6 +119,15 @@ def smoke_results(files: Mapping[str, Sequence[Path]]) -> set[Path]:
             mine = f"{numbers.stem}-"
             found |= {path for path in beside if f"{path.stem}-".startswith(mine) or path.name in figures}
     return found
+
+
+def _smoke_files(path: Path) -> list[str]:
+    """Return the files that a study's record names where it ran at toy size; none where not."""
+    try:
+        record = read_record(path)
+    except InputError:
+        return []  # the study warns of it when it is run again
+    return [*record.files] if record.smoke else []
 
 
 def _smoke_figures(path: Path) -> list[object] | None:

@@ -254,6 +254,20 @@ def test_smoke_figures_of_other_names_stand_apart_too(tree, capfd):
         assert ("98.76" in text) != apart and "smoke: study/own/codes.png" not in text
 
 
+def test_smoke_results_of_studies_without_numbers_stand_apart_by_their_record(tree, capfd):
+    """`study power` and `render-error` write tables alone."""
+    put(tree / "study/own/render-error.csv", "method,mae_mm\nargmax,98.76\n")
+    put(tree / "study/own/ultraphase-power.png", png(30))
+    files = dict.fromkeys(("render-error.csv", "ultraphase-power.png"), "ab" * 32)
+    for smoke in (False, True):
+        record = {"study": "power", "asked": {}, "smoke": smoke, "files": files}
+        put(tree / "study/own/power.run.json", record)
+        _, text = made(tree, capfd)
+        apart = text[text.find('<section id="smoke"') :] if smoke else ""
+        assert ("98.76" in text) != smoke and "power.run.json" not in text
+        assert all((f"study/own/{name}" in apart) == smoke for name in files)
+
+
 def test_an_empty_folder_makes_a_page_of_what_is_missing(tmp_path, capfd):
     (tmp_path / "results").mkdir()
     message, text = made(tmp_path / "results", capfd)
