@@ -143,7 +143,9 @@ def _views(command: Study, quality: tuple[int, int], again: int, cache: Path, pr
 
 
 def _view(job: Job, view: int, again: int, cache: Path, progress: Progress) -> Transient:
-    path = cache / f"render-error-{key_of({**asdict(job), 'view': view, 'again': again})}.exr"
+    inputs = scene_set(job.set).inputs_sha256(view)
+    key = key_of({**job.made(), "view": view, "again": again, "inputs_sha256": inputs})
+    path = cache / f"render-error-{key}.exr"
     if path.is_file():
         try:
             return read_transient(path)

@@ -10,6 +10,7 @@ import pytest
 from csph.evaluation.methods import EvaluationPlan
 from csph.training.views import Views
 from render.transient import read_transient
+from scene2spad.bench.rendering import references
 from scene2spad.cli import main
 from scene2spad.datasets.planes import random_planes, wall
 from scene2spad.datasets.rendering import Job, render_view
@@ -92,6 +93,23 @@ def test_smoke_is_one_view_at_coarse_qualities(capfd, tmp_path):
     assert main(["study", "render-error", "--preset", "smoke", *small]) == 0
     last = [line for line in capfd.readouterr().out.splitlines() if " +- " in line][-1].split()
     assert last[:3] == ["4", "128", "0"] and last[4] == "-" and "nan" not in "".join(last)
+
+
+def test_renders_of_other_code_or_other_files_are_made_again(capfd, tmp_path, monkeypatch):
+    """The cache took renders of older tolerances and versions for its own, and those of files that had changed."""
+    monkeypatch.setattr(render_error, "SMOKE_QUALITIES", ((1, 4),))
+    monkeypatch.setattr(render_error, "SMOKE_FINE", (1, 16))
+    asked = ["--preset", "smoke", "--width", "8", "--height", "6", "--out", str(tmp_path / "out")]
+    for place, value, files in (
+        ("scene2spad.bench.rendering.references.FORMAT", references.FORMAT, 4),
+        ("scene2spad.datasets.rendering.THINNED", 0.03, 8),
+        ("scene2spad.bench.rendering.references.version", lambda name: "0.0.1", 12),
+        ("scenes.library.sets.SceneSet.inputs_sha256", lambda self, view: {"a.png": "other"}, 16),
+    ):
+        monkeypatch.setattr(place, value)
+        status, _, message = run(capfd, *asked, "--cache", str(tmp_path / "cache"))
+        assert status == 0, message
+        assert len([*(tmp_path / "cache").iterdir()]) == files, place
 
 
 def test_views_without_an_error_are_refused():

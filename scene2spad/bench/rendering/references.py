@@ -8,6 +8,7 @@ import logging
 import os
 from collections.abc import Callable
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from scenes.errors import InputError
 from scenes.files import read_arrays, whole_file
 
 log = logging.getLogger("scene2spad")
-FORMAT = 1
+FORMAT = 1  # of what is kept, renders of studies too: another number forgets them within a version
 FIRST_SEED = 1_000_000  # far from the seeds of what is judged
 
 
@@ -26,8 +27,10 @@ def default_folder() -> Path:
 
 
 def key_of(parts: dict) -> str:
-    """Return a hash of everything that decides a reference (plain JSON values)."""
-    return hashlib.sha256(json.dumps({**parts, "format": FORMAT}, sort_keys=True).encode()).hexdigest()[:20]
+    """Return a hash of everything that decides a render that is kept (plain JSON values), this version's code among
+    it."""
+    whole = {**parts, "format": FORMAT, "version": version("scene2spad")}
+    return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:20]
 
 
 def reference(

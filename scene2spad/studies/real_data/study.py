@@ -7,7 +7,6 @@ says of these is said of rendered captures.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import math
@@ -23,6 +22,7 @@ from csph.weights.cards import checkpoint_of
 from render.engine import render
 from render.settings import RenderSettings
 from render.transient import Transient, read_transient, write_transient
+from scene2spad.bench.rendering.references import key_of
 from scene2spad.networks.training import classical
 from scene2spad.options.experiments import Study
 from scene2spad.plots.figures import display
@@ -186,9 +186,9 @@ def make_capture(
     folder.mkdir(parents=True, exist_ok=True)
     sensor = prototype()
     light = {"scene": scene.digest(), "settings": vars(preset.settings), "seed": seed}
-    truth = folder / f"{one.name}-{_key(light)}.exr"
+    truth = folder / f"{one.name}-{key_of(light)}.exr"
     whole = {**light, "sensor": sensor.to_dict(), "budget": one.budget.to_dict()}
-    path = folder / f"{one.name}-{_key(whole)}.mat"
+    path = folder / f"{one.name}-{key_of(whole)}.mat"
     if truth.is_file():
         transient = read_transient(truth)
     else:
@@ -201,10 +201,6 @@ def make_capture(
         photograph = np.rint(255 * display(transient.ambient, 0.9)).astype(np.uint8)
         write_linospad([capture_of(detections, photograph)], path)
     return path, transient
-
-
-def _key(values: dict) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def _view(capture: Capture, name: str, fov_deg: float = FOV_DEG, truth: Transient | None = None) -> View:
