@@ -20,6 +20,7 @@ from scene2spad.networks.results import Store
 from scene2spad.networks.training import network_method
 from scenes.errors import InputError, require
 from scenes.files import read_array
+from scenes.json_types import JsonObject
 from scenes.library.sets import scene_set
 from scenes.offsets import OffsetMode
 from scenes.progress import Progress
@@ -92,20 +93,26 @@ def rendered(
     number = of.size if count is None else count
     if number is None:
         raise InputError(f"{name}: has no end, say how many views")
-    result = make_set(job, number, path, progress=progress)
-    require(not result["failed"], f"{path}: views {result['failed']} could not be rendered")
+    _require_whole(make_set(job, number, path, progress=progress), path)
     return TestSet(name, read_views(path), offset_m, mode).first(count)
 
 
 def rooms(folder: Path, progress: Progress) -> Path:
-    """Return the pack of ROOMS views of rooms, direct light alone, made where it is not there."""
+    """Return the pack of ROOMS views of rooms, direct light alone, made where it is not there.
+
+    Raises InputError where a view cannot be rendered: asked again, those alone are tried.
+    """
     pack = folder / "rooms.h5"
     if not pack.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         job = Job("rooms/train", width=64, height=64, bounces=1, grid=4, error=0.01)
-        make_set(job, ROOMS, folder / "rooms", workers=2, progress=progress)
+        _require_whole(make_set(job, ROOMS, folder / "rooms", workers=2, progress=progress), folder / "rooms")
         pack_set(folder / "rooms", pack, progress)
     return pack
+
+
+def _require_whole(made: JsonObject, path: Path) -> None:
+    require(not made["failed"], f"{path}: views {made['failed']} could not be rendered")
 
 
 def evaluated(
