@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from csph.training.views import read_views, training_parts
 from csph.weights.shipped import WEIGHTS
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, Trained
 from scene2spad.networks.test_sets import rooms
 from scene2spad.networks.training import PLANES
 from scene2spad.options.experiments import Study
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.progress import Progress
 
 OTHER_SEEDS = (1, 2)
@@ -37,15 +38,19 @@ def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> M
     """Return models of --models (else of --out), then of the package; with --retrain, and in `smoke`, all trained
     there.
 
-    Absent ones are named, with the command that makes each. Raises InputError where none is found, and for a model of
-    another configuration under a wanted name.
+    Absent ones are named, with the command that makes each. Raises InputError where none is found, for a model of
+    another configuration under a wanted name, and for a finished one that is not what is to be trained.
     """
     folder, library = command.out / command.preset, _library(command)
     training = command.set or (Path(PLANES) if command.preset == "smoke" else None)
-    if library.shipped is None:
-        training = training or rooms(folder / "sets", progress)
-        library.train(wanted, command.preset, training, progress)
     found = library.gather(wanted)
+    todo = [one for one in wanted if one not in found]
+    if library.shipped is None:
+        _check_as_asked(found.values(), command)
+        if todo:
+            training = training or rooms(folder / "sets", progress)
+            library.train(todo, command.preset, training, progress)
+            found = library.gather(wanted)
     if not found:
         message = f"holds none of the {len(wanted)} models, nor does the package; give --models FOLDER or --retrain"
         raise InputError(f"{library.folder}: {message}")
@@ -91,6 +96,20 @@ def where_trained(wanted: Sequence[ModelSpec], command: Study) -> dict[ModelSpec
 def _library(command: Study) -> ModelRegistry:
     retrain = command.retrain or command.preset == "smoke"
     return ModelRegistry(models_folder(command), None if retrain else WEIGHTS)
+
+
+def _check_as_asked(finished: Iterable[Trained], command: Study) -> None:
+    """Raise InputError for a finished run of another preset than --retrain asks for, or of another set than --set."""
+    parts: dict[str, int] | None = None
+    for one in finished:
+        run, preset = one.path.parent, one.config.preset
+        asked = not command.retrain or preset == command.preset
+        require(asked, f"{run}: was trained with --preset {preset}, not {command.preset}; give that, or other --models")
+        if command.set in (None, Path(PLANES)):
+            continue
+        parts = parts or training_parts(read_views(command.set))
+        same = str(one.config.data.get("training_sha256")) in parts
+        require(same, f"{run}: was not trained on --set {command.set}; give its set, or other --models")
 
 
 def _warn_if_unlike(found: Iterable[Trained]) -> None:
