@@ -9,7 +9,7 @@ from csph.levels import PHOTON_LEVELS
 from scene2spad.cli import main
 from scene2spad.networks.lookup import found_only
 from scene2spad.options.experiments import Study
-from scene2spad.studies.chip.plan import MAIN, Plan
+from scene2spad.studies.chip.plan import MAIN, SMOKE, Plan
 from scene2spad.studies.chip.study import compared_rows, in_words
 from scene2spad.studies.power.front import (
     LOST_LIMIT,
@@ -29,18 +29,19 @@ from ultraphase.power import measured_cost, sweep
 
 def test_models_are_compared_in_pairs():
     random = np.random.default_rng(0)
-    hard = {f"scene {n}": 50 + 40 * random.random((1, 16)) for n in range(8)}
+    # two views of each scene at 16 levels: views are no levels
+    hard = {f"scene {n}": 50 + 40 * random.random((1, 32)) for n in range(8)}
     values = {
         "a": hard,
         "a on the chip": {scene: 1.004 * v + 0.1 * random.normal(size=v.shape) for scene, v in hard.items()},
     }
     values |= {"b": hard, "b on the chip": {scene: 1.03 * v for scene, v in hard.items()}}
-    first, second = compared_rows("set", {"a": "a", "b": "a"}, values)
+    first, second = compared_rows("set", {"a": "a", "b": "a"}, values, 16)
     assert first["difference"] == pytest.approx(0.004, abs=0.001) and first["holds"] is True
     assert first["low"] < first["difference"] < first["high"] and (first["scenes"], first["levels"]) == (8, 16)
     assert second["difference"] == pytest.approx(0.03, abs=1e-6) and second["holds"] is False
     alone = {name: {"only": next(iter(v.values()))} for name, v in values.items()}
-    (single,) = compared_rows("set", {"a": "a"}, alone)
+    (single,) = compared_rows("set", {"a": "a"}, alone, 16)
     assert single["holds"] is None and "no interval: one scene" in in_words(single)
     assert "nan" not in in_words(single) and " to +" in in_words(first)
 
@@ -119,4 +120,6 @@ def test_study_chip_at_toy_size(capfd, tmp_path):
     }
     still = [row for row in result["compared"] if row["set"] == "tabletop" and "int8" not in row["model"]]
     assert all(abs(row["difference"]) < 0.1 for row in still)
+    counts = {(row["set"], row["levels"]) for row in result["compared"]}
+    assert {("tabletop", len(SMOKE.levels)), ("rooms", len(SMOKE.other_levels))} <= counts
     assert {path.rsplit("/", 1)[1] for path in result["csv"]} >= {"chip.csv", "chip-compared.csv"}

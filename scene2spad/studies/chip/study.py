@@ -53,8 +53,13 @@ def run(command: Study, progress: Progress) -> dict:
     pair_rows = _pairs(store, subjects, plan, seed, progress)
     peers = {one.name: one.plain.name for one in models.found if one.plain in models.found}
     peers |= {f"{one.name}{_HEADROOM}": one.name for one in models.found if not one.int8}
-    compared = [line for name, rows in sets.items() for line in compared_rows(name, peers, _by_scene(rows))]
-    compared += compared_rows("published pairs", peers, _by_pair(pair_rows)) if pair_rows else []
+    compared: list[JsonObject] = []
+    for name, rows in sets.items():
+        levels = {(row.signal, row.background) for row in rows}
+        compared += compared_rows(name, peers, _by_scene(rows), len(levels))
+    if pair_rows:
+        levels = {(row["signal"], row["background"]) for row in pair_rows}
+        compared += compared_rows("published pairs", peers, _by_pair(pair_rows), len(levels))
     numbers: JsonObject = {
         **models.described(),
         "compared": compared,
@@ -111,10 +116,11 @@ def _by_pair(rows: Sequence[JsonObject]) -> dict[str, dict[str, np.ndarray]]:
 
 
 def compared_rows(
-    name: str, peers: Mapping[str, str], values: Mapping[str, Mapping[str, np.ndarray]]
+    name: str, peers: Mapping[str, str], values: Mapping[str, Mapping[str, np.ndarray]], levels: int
 ) -> list[JsonObject]:
     """Return a row a model on the chip, beside its float peer: MAE of both, and the paired difference as a fraction of
-    the peer's, with its 95 % interval (over scenes). `holds` where no more than WITHIN is lost."""
+    the peer's, with its 95 % interval (over scenes). `holds` where no more than WITHIN is lost. Each scene has its
+    values of every view at each of the photon `levels`."""
     rows = []
     for model, peer in peers.items():
         plain, chip = values[peer], values[f"{model}{_CHIP}"]
@@ -127,7 +133,7 @@ def compared_rows(
                 "model": model,
                 "beside": peer,
                 "scenes": len(plain),
-                "levels": int(next(iter(plain.values())).size),
+                "levels": levels,
                 "float_mae_mm": mae,
                 "chip_mae_mm": mae_chip,
                 "difference": fraction,
