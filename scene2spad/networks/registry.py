@@ -138,6 +138,13 @@ class EvaluatedModel(NamedTuple):
     digest: str
 
 
+def subject_of(name: str, model: DepthModel) -> EvaluatedModel:
+    """Return a model under a name, with the digest that its results are kept by: of its weights and its decoder, since
+    the same weights read by another decoder give other results."""
+    digest = f"{weights_sha256(model)} {model.config.decoder}"
+    return EvaluatedModel(name, model, hashlib.sha256(digest.encode()).hexdigest())
+
+
 @dataclass(frozen=True, eq=False)
 class Trained:
     """A model that was found or made, and where."""
@@ -152,11 +159,9 @@ class Trained:
     def digest(self) -> str:
         return weights_sha256(self.model)
 
-    @property
+    @cached_property
     def subject(self) -> EvaluatedModel:
-        # results of the same weights read by another decoder are other results
-        read = hashlib.sha256(f"{self.digest} {self.config.model.decoder}".encode()).hexdigest()
-        return EvaluatedModel(self.wanted.name, self.model, read)
+        return subject_of(self.wanted.name, self.model)
 
     @property
     def shipped(self) -> bool:

@@ -1,5 +1,8 @@
 """The end of the range in `study depth-offset`: what is changed at a time, and walls of one depth."""
 
+import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -28,6 +31,16 @@ def histogram():
 def test_every_arm_finds_a_near_wall(fourier, histogram, name):
     depth = network_method(range_end.arm(fourier, name, 0.0).model)(histogram)
     assert abs(np.median(depth) - 2.0) < 0.3
+
+
+def test_results_of_an_arm_are_kept_by_weights_and_decoder(fourier):
+    """The published grid is read by soft-argmax: its results were taken for those of the median."""
+    model = copy.copy(fourier.model)
+    model.config = replace(model.config, grid="published")
+    other = replace(fourier, model=model)
+    assert other.digest == fourier.digest
+    for name in range_end.ARMS:
+        assert range_end.arm(other, name).digest != range_end.arm(fourier, name).digest
 
 
 def test_arms_that_move_nothing_are_the_model_as_trained(fourier, histogram):

@@ -112,7 +112,7 @@ def arm(trained: Trained, name: str, offset_m: float = 0.0) -> EvaluatedModel:
 
 
 def _digest(trained: Trained, how: str) -> str:
-    return hashlib.sha256(f"{trained.digest} {how}".encode()).hexdigest()
+    return hashlib.sha256(f"{trained.subject.digest} {how}".encode()).hexdigest()
 
 
 def arm_rows(errors: Mapping[tuple[str, float], Sequence[float]]) -> list[JsonObject]:

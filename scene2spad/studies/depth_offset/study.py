@@ -16,11 +16,11 @@ from functools import cached_property
 from pathlib import Path
 
 from csph.evaluation.methods import Row, as_dicts
-from csph.networks.model import DepthModel, weights_sha256
+from csph.networks.model import DepthModel
 from csph.training.views import read_views, split_views
 from scene2spad.networks import published
 from scene2spad.networks.lookup import obtain
-from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained, ship_all
+from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained, ship_all, subject_of
 from scene2spad.networks.results import Store
 from scene2spad.networks.test_sets import TestSet, depth_map, evaluated, rendered
 from scene2spad.networks.training import PLANES, training_reach_m
@@ -299,9 +299,7 @@ def swapped(codes: Trained, network: Trained) -> EvaluatedModel:
     model.codes_layer.load_state_dict(codes.model.codes_layer.state_dict())
     model.network.load_state_dict(network.model.network.state_dict())
     model = model.to(next(codes.model.parameters()).device).eval()
-    return EvaluatedModel(
-        f"codes of {codes.wanted.name}, network of {network.wanted.name}", model, weights_sha256(model)
-    )
+    return subject_of(f"codes of {codes.wanted.name}, network of {network.wanted.name}", model)
 
 
 def _energies(study: Session) -> list[dict]:

@@ -146,13 +146,14 @@ def _networks(plan: Plan, found: dict[ModelSpec, Trained]) -> list[Subject]:
         if one not in found:
             continue
         model, bits = found[one].model.cpu(), code_bits(found[one].config.model.design)
-        subjects.append(Subject(one.label, partial(_by_network, model), (*SENSED, FOLDED), *bits, found[one].digest))
+        kept = found[one].subject.digest
+        subjects.append(Subject(one.label, partial(_by_network, model), (*SENSED, FOLDED), *bits, kept))
         if one in tuned:
             own = tuned[one].model.cpu()
-            subjects.append(Subject(one.label, partial(_by_network, own), (TRAINED,), *bits, tuned[one].digest))
+            subjects.append(Subject(one.label, partial(_by_network, own), (TRAINED,), *bits, tuned[one].subject.digest))
         if one == plan.on_chip:
             compiled = compile_model(model, one.name)
-            chip, digest = ChipDepth.of(compiled), compiled.digest(found[one].digest)
+            chip, digest = ChipDepth.of(compiled), compiled.digest(kept)
             subjects.append(Subject(f"{one.label}{CHIP}", partial(_by_chip, chip), SENSED, *bits, digest))
     return subjects
 
