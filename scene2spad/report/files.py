@@ -14,11 +14,12 @@ from typing import TypeVar
 
 from PIL import Image, UnidentifiedImageError
 
+from scene2spad.studies.every import TIMINGS
 from scene2spad.studies.records import ENDING, read_record
 from scenes.errors import InputError, printable, require
 from scenes.io.inputs import read_json_object
 
-# What studies keep for themselves: renders, sets, captures, kept results, trained models.
+# What studies keep for themselves, in their folder or in their preset's: renders, sets, captures, kept results, models.
 INSIDE = ("sets", "renders", "captures", "results", "maps", "models", "emulated")
 ENDINGS = (".png", ".csv", ".json")
 # Titles, and the columns that are shown, all where none is named.
@@ -93,18 +94,23 @@ def gather(root: Path) -> Found:
     records: list[Path] = []
     configurations: dict[str, list[Path]] = {name: [] for name in CONFIGURATIONS}
     for path in sorted(path for path in root.rglob("*") if path.is_file()):
-        inside = path.relative_to(root).parts[:-1]
         if path.name in configurations:
             configurations[path.name].append(path)
         elif path.name.endswith(ENDING):
             records.append(path)
-        elif path.suffix in ENDINGS and not path.name.startswith(".") and not {*inside} & {*INSIDE}:
+        elif path.suffix in ENDINGS and not path.name.startswith(".") and not _is_kept_by_study(path, root):
             files.setdefault(path.name, []).append(path)
     smoke = smoke_results(files, records)
     kept = {name: [path for path in paths if path not in smoke] for name, paths in files.items()}
     for paths in kept.values():
         paths.sort(key=lambda path: (-path.stat().st_mtime, path))
     return Found(root, {name: paths for name, paths in kept.items() if paths}, sorted(smoke), configurations)
+
+
+def _is_kept_by_study(path: Path, root: Path) -> bool:
+    """Return whether a file lies in a folder of INSIDE of a study. Folders of one's own may have these names, too."""
+    own = (folder for folder in path.parents if folder.name in INSIDE and root in folder.parents)
+    return any((above / TIMINGS).is_file() for folder in own for above in folder.parents[:2])
 
 
 def smoke_results(files: Mapping[str, Sequence[Path]], records: Sequence[Path]) -> set[Path]:

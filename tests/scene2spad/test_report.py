@@ -112,6 +112,8 @@ def tree(tmp_path) -> Path:
     put(root / "study/smoke/sets/tabletop/set.json", {"set": "tabletop", "grid": 4, "deep": {"a": 1, "b": {}}})
     put(root / "study/smoke/models/m/config.json", {"preset": "smoke", "rate": 0.001})
     put(root / "study/smoke/renders/inner.png", png(6))
+    put(root / "study/emulated/inner.png", png(7))
+    put(root / "study/timings.jsonl", '{"study": "fourier"}\n')
     return root
 
 
@@ -160,6 +162,15 @@ def test_pictures_are_whole_in_it_once_and_told(tree, capfd):
     assert all(one["alt"] and (one["width"], one["height"]) == ("9", "7") for one in images)
     words = Page(text).words
     assert "1 older of that name not shown" in words and "shown above" in words
+
+
+def test_results_in_folders_named_as_those_inside_are_shown(tree, capfd):
+    """All below `results` or `maps` was passed over, even where that folder held the studies."""
+    put(tree / "project/results/maps/study/timings.jsonl", '{"study": "codes"}\n')
+    put(tree / "project/results/maps/study/codes.png", png(40))
+    put(tree / "project/results/maps/study/laptop/models/m/log.csv", "step\n1\n")
+    _, text = made(tree, capfd)
+    assert base64.b64encode(png(40)).decode() in text and "log.csv" not in text
 
 
 def test_text_of_results_is_text(tree, capfd):
