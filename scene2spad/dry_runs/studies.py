@@ -8,11 +8,11 @@ from pathlib import Path
 from statistics import median
 
 from csph.weights.cards import checkpoint_of
-from csph.weights.shipped import shipped_file
+from csph.weights.shipped import WEIGHTS
 from scene2spad.dry_runs.resources import memory
 from scene2spad.dry_runs.training import step_seconds
 from scene2spad.networks.lookup import OTHER_SEEDS, models_folder
-from scene2spad.networks.registry import ModelSpec
+from scene2spad.networks.registry import ModelRegistry, ModelSpec
 from scene2spad.networks.training import PLANES, config_of
 from scene2spad.options.experiments import ABLATIONS, Study
 from scene2spad.options.networks import TrainingPreset
@@ -22,7 +22,7 @@ from scenes.io.inputs import read_whole_lines
 
 def dry_run(command: Study) -> dict:
     """Return models, kept results, memory and seconds of one study, as far as they are known. InputError for a network
-    that is given and is not there."""
+    that is given and is not there, and for another model under a wanted name."""
     wanted = wanted_models(command)
     folder = command.out / command.preset
     trains = trains_models(command)
@@ -127,13 +127,11 @@ def recorded_seconds(command: Study) -> list[float]:
 
 
 def _found(wanted: Sequence[ModelSpec], command: Study, *, shipped: bool) -> tuple[list[ModelSpec], list[ModelSpec]]:
-    """Return the models that are in the folder of runs or (`shipped`) in the package, and those that are in neither."""
-
-    def is_there(one: ModelSpec) -> bool:
-        run = models_folder(command) / one.name / "model.safetensors"
-        return run.is_file() or (shipped and shipped_file(one.name).is_file())
-
-    return [one for one in wanted if is_there(one)], [one for one in wanted if not is_there(one)]
+    """Return the models that are finished in the folder of runs or (`shipped`) in the package, and those that are in
+    neither."""
+    library = ModelRegistry(models_folder(command), WEIGHTS if shipped else None)
+    there = [one for one in wanted if library.has(one)]
+    return there, [one for one in wanted if one not in there]
 
 
 def _training_seconds(one: ModelSpec, preset: TrainingPreset) -> float:

@@ -233,15 +233,29 @@ class ModelRegistry:
     def find(self, wanted: ModelSpec) -> Trained | None:
         """Return the model if it is there and its training came to its end. Raises InputError for another under its
         name."""
-        run = self.folder / wanted.name / "model.safetensors"
+        run = self._run_of(wanted)
         if run.is_file():
             found = _loaded(wanted, run)
             if _finished(found):
                 return found
             log.warning("%s: its training has not come to its end; left out", run.parent)
             return None
-        packaged = None if self.shipped is None else shipped_file(wanted.name, self.shipped)
-        return _loaded(wanted, packaged) if packaged is not None and packaged.is_file() else None
+        packaged = self._packaged(wanted)
+        return None if packaged is None else _loaded(wanted, packaged)
+
+    def has(self, wanted: ModelSpec) -> bool:
+        """Return whether `find` returns a model; those of the package are not loaded for it. Raises InputError as
+        `find` does."""
+        if self._run_of(wanted).is_file():
+            return self.find(wanted) is not None
+        return self._packaged(wanted) is not None
+
+    def _run_of(self, wanted: ModelSpec) -> Path:
+        return self.folder / wanted.name / "model.safetensors"
+
+    def _packaged(self, wanted: ModelSpec) -> Path | None:
+        path = None if self.shipped is None else shipped_file(wanted.name, self.shipped)
+        return path if path is not None and path.is_file() else None
 
     def gather(self, wanted: Sequence[ModelSpec]) -> dict[ModelSpec, Trained]:
         """Return those that are there, in the order asked for."""

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from csph.weights.shipped import RESUME
 from scene2spad.cli import main
 from scene2spad.dry_runs.rendering import (
     LIBRARY_BYTES,
@@ -16,6 +17,7 @@ from scene2spad.dry_runs.rendering import (
     peak_of_render,
     trial_sizes,
 )
+from scene2spad.networks.registry import ModelRegistry, ModelSpec
 from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study
 from scene2spad.studies import every
 from scenes.errors import InputError
@@ -162,6 +164,19 @@ def test_a_dry_study_lists_what_it_would_find_and_what_it_is_given(capfd, folder
         assert answer(capfd, "study", name, "--checkpoints", "none-s0", "--dry-run")["models"]["there"] == ["none-s0"]
         assert main(["study", name, "--checkpoints", "nowhere", "--dry-run"]) == 2
     assert files(folder) == []
+
+
+def test_a_dry_study_counts_unfinished_trainings_as_to_be_trained(capfd, folder):
+    """The weights of the first epoch are there long before the training's end."""
+    one = ModelSpec("gray", (1024, 1, 1))
+    ModelRegistry(folder / "models", None).train([one], "smoke", Path("planes"), lambda what, fraction: None)
+    asked = ("study", "transport", "--dry-run", "--retrain", "--preset", "smoke", "--models", "models")
+    assert answer(capfd, *asked)["models"]["there"] == [one.name]
+    run = folder / "models" / one.name
+    (run / "last.safetensors").unlink()
+    (run / RESUME).touch()
+    said = answer(capfd, *asked)["models"]
+    assert said["there"] == [] and one.name in said["to_train"]
 
 
 @pytest.fixture

@@ -147,10 +147,12 @@ def test_unfinished_runs_are_left_out(folder, tmp_path, caplog):
     for name in ("model.safetensors", "config.json", "log.csv"):
         (run / name).write_bytes((folder / LEARNED.name / name).read_bytes())
     assert ModelRegistry(tmp_path).find(LEARNED) is not None  # its log reaches the last step
+    assert ModelRegistry(tmp_path).has(LEARNED) and not ModelRegistry(tmp_path / "none", None).has(LEARNED)
     rows = list(csv.reader((run / "log.csv").open()))
     (run / "log.csv").write_text("\n".join(",".join(row) for row in rows[:-1]) + "\n")
     with caplog.at_level(logging.WARNING, "scene2spad"):
         assert ModelRegistry(tmp_path).find(LEARNED) is None
+        assert not ModelRegistry(tmp_path).has(LEARNED)
     assert "not come to its end" in caplog.text
 
 
