@@ -14,7 +14,7 @@ from scene2spad.dry_runs.training import step_seconds
 from scene2spad.networks.lookup import OTHER_SEEDS, models_folder
 from scene2spad.networks.registry import ModelRegistry, ModelSpec
 from scene2spad.networks.training import PLANES, config_of
-from scene2spad.options.experiments import ABLATIONS, Study
+from scene2spad.options.experiments import ABLATIONS, Study, trains_models
 from scene2spad.options.networks import TrainingPreset
 from scene2spad.studies.every import TIMINGS
 from scenes.io.inputs import read_whole_lines
@@ -25,7 +25,7 @@ def dry_run(command: Study) -> dict:
     that is given and is not there, and for another model under a wanted name."""
     wanted = wanted_models(command)
     folder = command.out / command.preset
-    trains = trains_models(command)
+    trains = trains_models(command.name, command)
     there, missing = _found(wanted, command, shipped=not trains)
     beside, _ = _found(models_beside(command), command, shipped=not trains)
     given = given_networks(command)
@@ -53,13 +53,6 @@ def dry_run(command: Study) -> dict:
         "basis": "; ".join(basis) or "unknown: no run of this preset has been recorded here",
         "out": str(command.out),
     }
-
-
-def trains_models(command: Study) -> bool:
-    """Return whether a study trains what it does not find: with --retrain, and where `smoke` has models of its own."""
-    if command.name in ("transport", "power"):
-        return command.name == "transport" and command.retrain
-    return command.retrain or command.preset == "smoke"
 
 
 def given_networks(command: Study) -> list[str]:

@@ -13,7 +13,7 @@ from csph.weights.shipped import WEIGHTS
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, Trained
 from scene2spad.networks.test_sets import rooms
 from scene2spad.networks.training import PLANES
-from scene2spad.options.experiments import Study
+from scene2spad.options.experiments import Study, trains_models
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 
@@ -94,8 +94,7 @@ def where_trained(wanted: Sequence[ModelSpec], command: Study) -> dict[ModelSpec
 
 
 def _library(command: Study) -> ModelRegistry:
-    retrain = command.retrain or command.preset == "smoke"
-    return ModelRegistry(models_folder(command), None if retrain else WEIGHTS)
+    return ModelRegistry(models_folder(command), None if trains_models(command.name, command) else WEIGHTS)
 
 
 def _check_as_asked(finished: Iterable[Trained], command: Study) -> None:

@@ -164,6 +164,13 @@ class Study(Long):
     """Folder for the figures (.png) and tables (.csv)."""
 
 
+def trains_models(name: str, command: Study) -> bool:
+    """Return whether a study, by its name, trains what it does not find: with --retrain, and of `smoke` all but
+    `transport`, which has something to say without models."""
+    toy = command.preset == "smoke" and name != "transport"
+    return name in TRAINING and (command.retrain or toy)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Report(Common):
     """One self-contained HTML page of every figure, table, configuration and version made so far: speed against error

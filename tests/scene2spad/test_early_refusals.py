@@ -132,6 +132,7 @@ def test_a_render_that_cannot_be_is_refused_before_it_begins(tmp_path, capsys, m
         ("chip --retrain --set nosuch.h5", "nosuch.h5: file not found (--set)"),
         ("chip --set nosuch.h5", "--set nosuch.h5 is for models that are trained (--retrain or --preset smoke)"),
         ("transport --preset smoke --set nosuch.h5", "--set nosuch.h5 is for models that are trained"),
+        ("power --preset smoke --models nosuch", "nosuch: folder of models not found (--models)"),
         ("tensors --retrain", "study tensors: --retrain is for study chip, depth-offset"),
         ("memory --models nosuch", "study memory: --models nosuch is for study chip, depth-offset"),
         ("power --set nosuch.h5", "study power: --set nosuch.h5 is for study chip, depth-offset"),

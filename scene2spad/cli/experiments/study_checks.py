@@ -10,7 +10,7 @@ from csph.codes.design import Design
 from scene2spad.cli.checks import check_image, check_model
 from scene2spad.cli.paths import input_file, output_folder
 from scene2spad.options.common import only_for
-from scene2spad.options.experiments import OPTIONS_OF, STUDIES, TRAINING, Study
+from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study, trains_models
 from scenes.errors import InputError, require
 from scenes.library.catalog import EXTENSIONS, load_scene
 from scenes.library.sets import scene_set
@@ -43,14 +43,14 @@ def check_study(command: Study) -> None:
 
 def _check_training(command: Study, names: tuple[str, ...]) -> None:
     """Check what models are trained on, and where they lie."""
-    trains = command.retrain or (command.preset == "smoke" and names != ("transport",))
+    trains = any(trains_models(name, command) for name in names)
     used = trains or "depth-offset" in names
     only_for(command, f"study {command.name}", {"set": (used, "models that are trained (--retrain or --preset smoke)")})
     if command.set is not None and command.set != PLANES:
         require(command.set.exists(), f"{command.set}: file not found (--set)")
     if command.models is None:
         return
-    if trains and any(name in TRAINING for name in names):
+    if trains:
         output_folder(command.models, "the models")
     require(command.models.is_dir() or (trains and not command.models.exists()), _no_folder(command.models))
 
