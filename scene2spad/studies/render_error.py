@@ -113,7 +113,7 @@ def run(command: Study, progress: Progress) -> dict:
         views = fine[0] if is_fine else _views(command, quality, again, cache, progress)
         own = statistics.fmean(t.meta["relative_error"]["total"] for t in views.transients)
         measured = math.nan if is_fine else measured_error(views.transients, *(v.transients for v in fine))
-        plans = [EvaluationPlan(extent.levels, tile, seed=command.seed + draw) for draw in range(extent.draws)]
+        plans = [EvaluationPlan(extent.levels, tile, seed=seed) for seed in photon_seeds(command.seed, extent.draws)]
         for method, found in errors_of(methods, views, sensor, plans).items():
             rows.append(Row(*quality, again, own, measured, method, *found))
     command.out.mkdir(parents=True, exist_ok=True)
@@ -121,6 +121,11 @@ def run(command: Study, progress: Progress) -> dict:
     shown: list[Any] = [asdict(row) for row in rows] if command.json else _lines(rows, list(methods))
     photons = [list(level) for level in extent.levels]
     return {"preset": command.preset, "views": extent.views, "photons": photons, "rows": shown, "csv": str(table)}
+
+
+def photon_seeds(seed: int, draws: int) -> range:
+    """Return the seeds of the draws of photons; those of another seed of the command are all others."""
+    return range(seed * draws, (seed + 1) * draws)
 
 
 def _sensor_of(models: Mapping[str, DepthModel]) -> Sensor:
