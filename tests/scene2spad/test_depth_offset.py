@@ -124,6 +124,18 @@ def test_the_legend_of_the_sweep_names_what_is_on_its_axis(monkeypatch, tmp_path
     assert sum("test depths" in text.get_text() for text in legend.get_texts()) == named
 
 
+def test_ratios_are_drawn_where_their_means_are_and_every_mark_is_named(monkeypatch, tmp_path):
+    """With --full, 32x and 256x were triangles that no title named and no mean held."""
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure) or path)
+    rows = [{"design": "learned 1024x1x1", "compression": c, "seed": 1, "ratio": c / 8} for c in (32, 64, 128, 256)]
+    figures.every_seed(rows, [], tmp_path / "ratios.png")
+    (panel,) = drawn[0].axes
+    assert sorted(line.get_ydata()[0] for line in panel.lines if line.get_marker() in "os^v") == [8, 16]
+    assert "circles 128x, squares 64x;" in panel.get_title() and "triangles" not in panel.get_title()
+    assert figures.marks_in_words((32, 256)) == "triangles 32x, triangles on their tips 256x"
+
+
 def test_a_break_lies_where_the_error_doubles():
     assert tables.break_m([0, 1, 2, 3], [10, 10, 30, 400]) == pytest.approx(1.5)
     assert tables.break_m([0, 1], [10, 20]) is None and tables.break_m([0.0], [10.0]) is None

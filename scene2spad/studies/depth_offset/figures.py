@@ -3,7 +3,7 @@ and cure, energies."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,14 @@ from scene2spad.plots.figures import draw_depth_row, plain_log, plt, save
 from scene2spad.plots.style import COLOURS as OKABE_ITO
 from scene2spad.plots.style import MARKERS, look
 from scene2spad.studies import tensors as tensor_figures
-from scene2spad.studies.depth_offset.tables import ENERGY_BAR, LEAST, boundary_bin, energy_history, energy_ratio
+from scene2spad.studies.depth_offset.tables import (
+    ENERGY_BAR,
+    LEAST,
+    RATIO_COMPRESSIONS,
+    boundary_bin,
+    energy_history,
+    energy_ratio,
+)
 from spad.sensor.model import Sensor
 
 # as in the paper: truncated Fourier blue, learned 1024 orange, 1024x4x4 green, 256x4x4 red
@@ -32,7 +39,8 @@ COLOURS = {
     "peak": OKABE_ITO["grey"],
 }
 MARKS = dict(zip(COLOURS, MARKERS, strict=False))  # where designs are lines
-BY_COMPRESSION = {128: "o", 64: "s"}  # others ^
+BY_COMPRESSION = {128: "o", 64: "s", 32: "^", 256: "v"}
+MARK_NAMES = {"o": "circles", "s": "squares", "^": "triangles", "v": "triangles on their tips"}
 PAPER_FIGURE = {128: "1", 64: "17"}
 NO_OFFSETS = ", trained with offsets"
 
@@ -62,13 +70,15 @@ def tensors(models: Sequence[Trained], compressions: Sequence[int], out: Path) -
 
 
 def every_seed(ratios: Sequence[dict], bars: Sequence[dict], path: Path) -> Path:
-    """Return far error over near error of every seed, the geometric means that the bars are about, and the bars."""
+    """Return far error over near error of every seed, the geometric means that the bars are about, and the bars; at
+    the compressions that these means are over alone."""
+    ratios = [row for row in ratios if row["compression"] in RATIO_COMPRESSIONS]
     labels = list(dict.fromkeys(row["design"] for row in ratios))
     figure, panel = plt.subplots(figsize=(max(5.0, 1.6 * len(labels) + 1.5), 4.6), layout="constrained")
     for at, label in enumerate(labels):
         for row in (row for row in ratios if row["design"] == label):
             shift = 0.16 * (np.log2(row["compression"]) - 6.5) + 0.05 * (row["seed"] - 1)
-            marker = BY_COMPRESSION.get(row["compression"], "^")
+            marker = BY_COMPRESSION[row["compression"]]
             panel.plot(at + shift, row["ratio"], marker, color=colour_of(label), ms=6, alpha=0.8)
         bar = next((b for b in bars if b["design"] == label), None)
         if bar is not None:
@@ -80,12 +90,17 @@ def every_seed(ratios: Sequence[dict], bars: Sequence[dict], path: Path) -> Path
     plain_log(panel)
     panel.set_xticks(range(len(labels)), [label.replace(" ", "\n", 1) for label in labels], fontsize=8.5)
     panel.set_ylabel("MAE 7 m farther in time / MAE as it is")
-    message = (
-        "Every seed: circles 128x (and without codes), squares 64x\nlines: geometric means, dotted: bars set beforehand"
-    )
+    marks = marks_in_words([row["compression"] for row in ratios])
+    message = f"Every seed: {marks}; circles without codes\nlines: geometric means, dotted: bars set beforehand"
     panel.set_title(message, fontsize=9)
     panel.grid(alpha=0.3, axis="y", which="both")
     return save(figure, path)
+
+
+def marks_in_words(compressions: Iterable[int]) -> str:
+    """Say which marks stand for which compressions: "circles 128x, squares 64x"."""
+    drawn = {*compressions}
+    return ", ".join(f"{MARK_NAMES[mark]} {ratio}x" for ratio, mark in BY_COMPRESSION.items() if ratio in drawn)
 
 
 def _on_cpu(coding: CodingTensor) -> CodingTensor:
@@ -292,7 +307,7 @@ def energy(models: Mapping[ModelSpec, Trained], ratios: Sequence[dict], path: Pa
         boundary = boundary_bin(reach, sensor)
         values = [energy_ratio(line, sensor.bins, boundary) for line in energies]
         style = {"color": colour_of(one.label), "ls": "--" if one.time_offset_m else "-"}
-        marker = BY_COMPRESSION.get(one.compression, "^")
+        marker = BY_COMPRESSION[one.compression]
         axes.plot(steps, values, lw=1, marker=marker, ms=3, **style)
     axes.axhline(ENERGY_BAR, color="0.5", lw=1, ls=":")
     plain_log(axes)
@@ -303,7 +318,7 @@ def energy(models: Mapping[ModelSpec, Trained], ratios: Sequence[dict], path: Pa
     axes.legend(
         handles=handles,
         fontsize=8,
-        title="circles 128x, squares 64x; dashed: time offsets; every seed",
+        title=f"{marks_in_words(w.compression for w in histories)}; dashed: time offsets; every seed",
         title_fontsize=8,
     )
     figure.suptitle("Energy of learned codes over time bins in training\n(dashed: 99.9 % training depth)", fontsize=11)
