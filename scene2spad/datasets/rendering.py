@@ -356,20 +356,22 @@ def make_set(
     check_asked(job, count, workers)
     folder = SetFolder(out, job.made())
     check_scenes(job, folder)
-    missing = count - sum(view < count for view in folder.records)
-    todo = (view for view in range(count) if view not in folder.records)
     report = progress or (lambda what, fraction: None)
     start = time.perf_counter()
-    with executor(workers if missing else 1, scheduler) as run:
-        folder.begin()  # not before a scheduler has answered: a mistyped address leaves no folder
-        endless = scene_set(job.set).size is None
-        job = _with_grid(job, folder, run, report) if missing and endless and job.grid is None else job
-        for number, done in enumerate(run(partial(render_views, job), views_by_place(job, todo), _lost), 1):
-            folder.add(done)
-            if "failed" in done.record:
-                log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
-            report(f"view {count - missing + number} of {count}", (count - missing + number) / count)
-    folder.close()
+    todo = folder.missing(count)
+    with executor(workers if todo else 1, scheduler) as run:
+        if todo or not folder.closed:
+            with folder.held():  # not before a scheduler has answered: a mistyped address leaves no folder
+                todo = folder.missing(count)
+                endless = scene_set(job.set).size is None
+                job = _with_grid(job, folder, run, report) if todo and endless and job.grid is None else job
+                work = run(partial(render_views, job), views_by_place(job, todo), _lost)
+                for number, done in enumerate(work, 1 + count - len(todo)):
+                    folder.add(done)
+                    if "failed" in done.record:
+                        log.warning("view %d failed: %s", done.record["view"], done.record["failed"])
+                    report(f"view {number} of {count}", number / count)
+                folder.close()
     seconds = time.perf_counter() - start
     records = [folder.records[view] for view in range(count)]
     good = [record for record in records if "failed" not in record]
@@ -387,9 +389,9 @@ def make_set(
     return {
         "scenes": len(good),
         "failed": [record["view"] for record in records if "failed" in record],
-        "rendered_now": missing,
+        "rendered_now": len(todo),
         "seconds": seconds,
-        "scenes_per_second": missing / seconds if missing else 0.0,
+        "scenes_per_second": len(todo) / seconds,
         "bytes_per_scene": sum(record["bytes"] for record in good) / len(good),
         "target_missed": len(missed),
         "error_together": together,

@@ -10,14 +10,21 @@ timings.jsonl seconds and places, kept out of the index so that two runs are the
 
 from __future__ import annotations
 
+import fcntl
 import json
+import logging
 import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from scenes.errors import InputError, require
 from scenes.files import append_line, finite, is_unclaimed, sweep, whole_file
 from scenes.io.inputs import read_text, read_whole_lines
+
+log = logging.getLogger("scene2spad")
 
 
 class Done(NamedTuple):
@@ -70,10 +77,27 @@ def _stands(folder: Path, record: dict) -> bool:
     return path.is_file() and path.stat().st_size == record.get("bytes")
 
 
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder until the end, or that of the process."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            message = "another process adds views to this set; run it again when that one has ended"
+            raise InputError(f"{folder}: {message}") from None
+        except OSError:  # some network file systems lock no folders
+            log.debug("%s: cannot be locked", folder, exc_info=True)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 class SetFolder:
     """A set's folder: `records` of what is there already, and where finished views go.
 
-    `made` is all that decides their bytes. Nothing is written before `begin`. Raises InputError for the folder of
+    `made` is all that decides their bytes. Nothing is written before `held`. Raises InputError for the folder of
     something else.
     """
 
@@ -83,15 +107,33 @@ class SetFolder:
         self.records = _records(path)
         self._made = made
 
-    def begin(self) -> None:
-        """Make the folder where it is not there, and remove what killed processes left half written."""
+    @property
+    def closed(self) -> bool:
+        """Whether every record stands in the index."""
+        return not (self.path / "journal.jsonl").exists()
+
+    def missing(self, count: int) -> list[int]:
+        """Return which of the first `count` views are not there."""
+        return [view for view in range(count) if view not in self.records]
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the folder, alone: make it where it is not there, and remove what killed processes left half written.
+
+        What others have added since this object was made is among `records`. Raises InputError while another process
+        holds the folder: the index of one would lose the views of the other.
+        """
         self.path.mkdir(parents=True, exist_ok=True)
-        if not (self.path / "set.json").is_file():
-            with whole_file(self.path / "set.json") as beside:
-                beside.write_text(_as_text(self._made))
-        (self.path / "views").mkdir(exist_ok=True)
-        for folder in (self.path, self.path / "views"):
-            sweep(folder)
+        with _locked(self.path):
+            _check_ours(self.path, self._made)
+            if not (self.path / "set.json").is_file():
+                with whole_file(self.path / "set.json") as beside:
+                    beside.write_text(_as_text(self._made))
+            (self.path / "views").mkdir(exist_ok=True)
+            for folder in (self.path, self.path / "views"):
+                sweep(folder)
+            self.records = _records(self.path)
+            yield
 
     def add(self, done: Done) -> None:
         """Write the file first, then the line that vouches for it."""

@@ -22,7 +22,7 @@ def dry_run(job: Job, count: int, out: Path, workers: int) -> dict:
     folder = SetFolder(out, job.made())
     check_scenes(job, folder)
     records = folder.records
-    missing = [view for view in range(count) if view not in records]
+    missing = folder.missing(count)
     camera = scene_set(job.set).view(0, seed=job.seed, width=job.width, height=job.height).camera
     timings = _recorded(out, records)
     tried = [] if timings or not missing else _trials(job, missing)

@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
-from set_folders import begun
+from set_folders import begun, finished
 
 from render.transient import read_transient
 from scene2spad.cli import main
@@ -111,3 +113,37 @@ def test_a_set_of_which_no_view_can_be_rendered_is_an_error(tmp_path, monkeypatc
     argv = ["dataset", "middlebury", "--width", "8", "--bounces", "1", "--error", "0.3", "--out", str(tmp_path / "set")]
     assert main(argv) == 2
     assert "set: none of 1 views could be rendered; view 0: " in capsys.readouterr().err
+
+
+def added(path: Path, view: int) -> str:
+    """Add a view to a set in this process; returns what was refused."""
+    folder = SetFolder(path, {"set": "any"})
+    try:
+        with folder.held():
+            folder.add(finished(view))
+            folder.close()
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def test_two_processes_do_not_lose_views_of_each_other(tmp_path):
+    """The later end wrote its own records alone over the index."""
+    folder, late = SetFolder(tmp_path / "set", {"set": "any"}), SetFolder(tmp_path / "set", {"set": "any"})
+    with ProcessPoolExecutor(1, get_context("spawn")) as other:
+        with folder.held():
+            folder.add(finished(0))
+            refused = other.submit(added, folder.path, 1).result()
+            assert "set: another process adds views to this set" in refused and "\n" not in refused
+        assert other.submit(added, folder.path, 1).result() == ""
+    with late.held():
+        late.add(finished(2))
+        late.close()
+    assert sorted(SetFolder(folder.path, {"set": "any"}).records) == [0, 1, 2]
+
+
+def test_a_finished_set_is_read_while_another_process_holds_it(small):
+    with SetFolder(small, JOB.made()).held():
+        assert make_set(JOB, 3, small)["rendered_now"] == 0
+        with pytest.raises(InputError, match="another process adds views"):
+            make_set(JOB, 4, small)

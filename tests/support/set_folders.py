@@ -8,10 +8,10 @@ from scene2spad.datasets.set_folder import Done, SetFolder, file_name
 
 
 def begun(path: Path, made: dict) -> SetFolder:
-    """Return a set's folder that is made, or gone on with."""
+    """Return a set's folder that is made, or gone on with; nobody holds it, as after a kill."""
     folder = SetFolder(path, made)
-    folder.begin()
-    return folder
+    with folder.held():
+        return folder
 
 
 def finished(view: int, **more: object) -> Done:
