@@ -22,7 +22,7 @@ from zipfile import ZipFile
 import numpy as np
 
 from scenes.errors import InputError, require
-from scenes.io.inputs import parse_json, regular_file
+from scenes.io.inputs import parse_json, read_text, regular_file
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 
@@ -196,6 +196,21 @@ def npy_array(file: IO[bytes], size: int, kinds: str = "biuf", name: str = "") -
     require(fits, f"{name} states shape {shape} of {dtype}, {left} bytes follow".strip())
     values = np.frombuffer(bytearray(file.read(left)), dtype)
     return values.reshape(shape, order="F" if columns_first else "C")
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Read the rows of a table, each by the names of its head.
+
+    Raises InputError in one line that names the file: missing, no text, no table, or rows of other lengths than its
+    head.
+    """
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_text(path, "table"), newline=""), strict=True))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a readable table ({error})") from None
+    uneven = next((number for number, row in enumerate(rows, 1) if None in row or None in row.values()), None)
+    require(uneven is None, f"{path}: row {uneven} is of another length than the head of the table")
+    return rows
 
 
 def write_csv(rows: Sequence[Mapping[str, object]], path: Path) -> Path:

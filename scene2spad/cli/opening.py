@@ -11,6 +11,7 @@ import numpy as np
 
 from scene2spad.cli.paths import begins, holds_kind, input_file
 from scenes.errors import InputError, require
+from scenes.files import read_array
 from scenes.io.hdf5 import HDF5_SUFFIXES
 from scenes.io.hdf5 import MARK as HDF5_MARK
 from scenes.io.hdf5 import SIGNATURE as HDF5_SIGNATURE
@@ -150,8 +151,8 @@ def _is_dense(path: Path) -> bool:
 def _is_cube(path: Path) -> bool:
     """Tell whether a .npy file holds an array of three dimensions: counts, and no codes."""
     try:
-        return np.load(path, mmap_mode="r", allow_pickle=False).ndim == 3
-    except (OSError, ValueError, EOFError):
+        return read_array(path).ndim == 3
+    except InputError:
         return False
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile, ZipFile
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -25,13 +25,16 @@ HEADER = "property float x property float y property float z property float inte
 
 def is_dense(path: Path) -> bool:
     """Tell whether a file (.npz, .h5) holds the arrays of a dense export, by their names alone."""
-    try:
-        if path.suffix.lower() == ".npz":
+    if path.suffix.lower() == ".npz":
+        try:
             with ZipFile(path) as file:
                 return {f"{name}.npy" for name in DENSE} <= {*file.namelist()}
+        except Exception:  # what zipfile raises for damaged directories is of many types
+            return False
+    try:
         with open_checked(path) as file:
             return {*DENSE} <= {*file}
-    except (InputError, OSError, BadZipFile):
+    except (InputError, OSError):
         return False
 
 

@@ -195,6 +195,21 @@ def test_reading_damaged_files_ends_in_one_line():
                 assert "\n" not in str(error) and "broken" in str(error)
 
 
+@pytest.mark.parametrize(("offset", "damage"), [(6, b"\x63"), (8, b"\x00\x08"), (46, b"\xff")])
+def test_damaged_directories_of_archives_are_one_line(tmp_path, capfd, offset, damage):
+    """Of the version that is needed, the flag of names in UTF-8, and a name."""
+    np.savez(tmp_path / "bad.npz", däta=np.ones(3))
+    content = bytearray((tmp_path / "bad.npz").read_bytes())
+    start = content.rindex(b"PK\x01\x02") + offset
+    content[start : start + len(damage)] = damage
+    (tmp_path / "bad.npz").write_bytes(content)
+    for argv in (["inspect", str(tmp_path / "bad.npz")], ["export", "g.h5", "--out", str(tmp_path / "bad.npz")]):
+        assert main(argv) == 2
+        message = capfd.readouterr().err
+        assert "bad.npz: " in message and message.count("\n") == 1
+    assert (tmp_path / "bad.npz").read_bytes() == content
+
+
 def test_time_first_is_told_by_the_file_where_sizes_do_not():
     """As many columns and rows as bins: only `axes` says which is time."""
     counts = np.random.default_rng(2).integers(0, 5, (8, 8, 8))

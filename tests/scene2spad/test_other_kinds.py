@@ -23,6 +23,8 @@ def test_a_file_of_another_kind_is_named(capsys, tmp_path, monkeypatch, command)
     Path("z.exr").write_text("hello")
     words["z.exr"] = "z.exr: is no OpenEXR file, whatever its name says"
     Path("t.csv").write_text("a,b\n1,2\n")
+    Path("bad.npy").write_bytes(b"\x93NUMPY\x01\x00\x0c\x00{'descr': (  \n")
+    words["bad.npy"] = "bad.npy: is of kind codes, expected a histogram"
     words["t.csv"] = "t.csv: is of kind table, expected a histogram (.h5); a table holds no photon counts of pixels"
     if command == "compare":
         words["a.exr"] = "a.exr: is of kind transient, expected a histogram; sense it first: `scene2spad sense`"

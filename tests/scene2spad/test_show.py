@@ -96,6 +96,14 @@ def test_tables_programs_and_sensors_have_pages(capfd):
     assert "bin_width" in Path("sensor.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("table", ["a,b\n1,2,3\n", "a,b\n1\n", f"a,b\n1,{'x' * 200_000}\n", 'a,b\n1,"2\n'])
+def test_tables_that_are_none_are_one_line(capfd, table):
+    Path("odd.csv").write_text(table)
+    assert main(["show", "odd.csv", "--out", "odd.html"]) == 2
+    message = capfd.readouterr().err
+    assert "odd.csv: " in message and message.count("\n") == 1 and not Path("odd.html").exists()
+
+
 def test_the_page_holds_the_counts_and_the_images(capfd):
     told(capfd, "show", "gallery.h5", "--out", "page.html")
     found, histogram = payload(Path("page.html")), read_histogram(Path("gallery.h5"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import tempfile
@@ -31,6 +30,7 @@ from scene2spad.cli.paths import (
 )
 from scene2spad.options.common import Common, File, GivenFile, Positional, only_for
 from scenes.errors import InputError, require
+from scenes.files import read_csv
 from scenes.io.inputs import read_text, read_whole_lines
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
@@ -133,7 +133,7 @@ def _content(command: Show, kind: str) -> Content:
         titles = {"program": "program of the in-pixel core", "text": "text: a program's listing, or codes"}
         return Content(path.name, {"kind": titles[kind]}, text=read_text(path))
     if kind == "table":
-        rows = list(csv.DictReader(read_text(path).splitlines()))
+        rows = read_csv(path)
         require(bool(rows), f"{path}: an empty table")
         return Content(path.name, {"kind": "table", "rows": str(len(rows))}, tables=((path.name, rows),))
     figure = _as_png(command, kind)
