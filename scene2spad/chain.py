@@ -193,9 +193,10 @@ def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | Dep
     histogram : Histogram
         What `sense`, `read_histogram` or `read_mat` gives.
     method : str, Path, CodingTensor or DepthModel
-        A classical estimator (argmax, matched, log-matched, lmf-published, correlation, coates), the name or file of a
-        trained network (`models` lists those that come with the package), a network that `load_model` gave, or a
-        temporal coding tensor, whose codes are decoded by correlation.
+        A classical estimator (argmax, matched, log-matched, lmf-published, correlation, coates), a code and its number
+        (fourier-16) or a file of codes (.npy, .txt), the name or file of a trained network (`models` lists those that
+        come with the package), a network that `load_model` gave, or a temporal coding tensor. Codes are decoded by
+        correlation.
 
     Returns
     -------
@@ -220,24 +221,16 @@ def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | Dep
     >>> coded.shape
     (8, 8)
     """
-    from spad.estimators.depth import METHODS, histogram_depth_m
+    from scene2spad.methods import decoded_by, depth_method
     from spad.measurements.histogram import Histogram
 
     require_kind(histogram, Histogram, "estimate_depth", " of `sense`, `read_histogram` or `read_mat`")
-    if isinstance(method, str) and method in METHODS:
-        return histogram_depth_m(histogram, method)
+    if isinstance(method, str | Path):
+        return depth_method(str(method), histogram.sensor)(histogram)
     from csph import CodingTensor
-    from scene2spad.methods import decoded_by
 
     if isinstance(method, CodingTensor):
         return decoded_by(method)(histogram)
-    if isinstance(method, str | Path):
-        try:
-            method = load_model(method)
-        except InputError as error:
-            raise InputError(
-                f"depth method {method!r} is none of {', '.join(METHODS)}, and no network: {error}"
-            ) from None
     require(hasattr(method, "estimate"), f"depth method {method!r}: expected a name, a file, codes or a network")
     return method.estimate(histogram).depth_m
 

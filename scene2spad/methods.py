@@ -27,26 +27,51 @@ def depth_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
     An estimator (argmax, matched, ...), a temporal code and its number (fourier-16) decoded by correlation, the name or
     file of a network, or a file of one's own codes (`codes_method`). Raises InputError for anything else.
     """
-    from spad.estimators.depth import METHODS, histogram_depth_m
-
-    if name in METHODS:
-        return lambda histogram: histogram_depth_m(histogram, name)
-    if is_codes_file(name):
-        return codes_method(Path(name), sensor)
-    found = re.fullmatch(r"([a-z-]+?)-(\d{1,4})", name)
-    if found is not None and found[1] in CODES:
-        from csph import CodingTensor, temporal_code
-
-        return decoded_by(CodingTensor(name, temporal_code(found[1], int(found[2]), sensor.bins, sensor, seed)))
+    if is_classical(name):
+        return classical_method(name, sensor, seed=seed)
     from csph.networks.model import load_model
     from csph.weights.cards import checkpoint_of
 
     try:
         model = load_model(checkpoint_of(name))[0]
     except InputError as error:
-        kinds = f"{', '.join(METHODS)}, a code such as fourier-16, codes in a file (.npy, .txt) or a network"
-        raise InputError(f"method {name!r} is none of {kinds}: {error}") from None
+        raise InputError(f"method {name!r} is none of {_classical_kinds()} or a network: {error}") from None
     return lambda histogram: model.estimate(histogram).depth_m
+
+
+def is_classical(name: str) -> bool:
+    """Tell whether a name is that of a method without a network."""
+    from spad.estimators.depth import METHODS
+
+    return name in METHODS or is_codes_file(name) or code_of(name) is not None
+
+
+def classical_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
+    """Return the method of a name as `depth_method` does, but none by a network; the seed is of random codes."""
+    from spad.estimators.depth import METHODS, histogram_depth_m
+
+    if name in METHODS:
+        return lambda histogram: histogram_depth_m(histogram, name)
+    if is_codes_file(name):
+        return codes_method(Path(name), sensor)
+    code = code_of(name)
+    if code is None:
+        raise InputError(f"method {name!r} is none of {_classical_kinds()}")
+    from csph import CodingTensor, temporal_code
+
+    return decoded_by(CodingTensor(name, temporal_code(*code, sensor.bins, sensor, seed)))
+
+
+def code_of(name: str) -> tuple[str, int] | None:
+    """Return a temporal code and its number by a name such as fourier-16; None for another name."""
+    found = re.fullmatch(r"([a-z-]+?)-(\d{1,4})", name)
+    return (found[1], int(found[2])) if found is not None and found[1] in CODES else None
+
+
+def _classical_kinds() -> str:
+    from spad.estimators.depth import METHODS
+
+    return f"{', '.join(METHODS)}, a code such as fourier-16, codes in a file (.npy, .txt)"
 
 
 def is_codes_file(name: str | Path) -> bool:

@@ -20,16 +20,15 @@ from csph.training.views import Views, check_truth, training_parts
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.renders import unsure_scenes, views_at
-from scene2spad.methods import codes_method, is_codes_file
+from scene2spad.methods import classical_method
 from scene2spad.networks.depth_maps import check_free, map_writer
 from scene2spad.networks.end_warnings import warn_of_ends
-from scene2spad.networks.training import baseline, common_tile, network_method
+from scene2spad.networks.training import common_tile, network_method
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
 from scenes.files import write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
-from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")
 
@@ -82,7 +81,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
             read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}
             methods[f"{path}{suffix}"] = network_method(model, **read, overflows=overflows)
             groups.setdefault(f"{group}{suffix}", []).append(f"{path}{suffix}")
-    methods |= {name: _baseline(name, sensor) for name in command.baselines}
+    methods |= {name: classical_method(name, sensor, seed=command.seed) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
     tile = common_tile(models) if command.tiled else (1, 1)
     plan = EvaluationPlan(levels, tile, command.offset, command.seed, command.law)
@@ -100,11 +99,6 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     shown |= _counted(found, command.set, sensor.recorded_range_m) | _scenes_counted(command.set, views)
     shown |= {"overflows": sum(overflows), "csv": str(table)}
     return shown | ({"maps": str(folder)} if command.maps else {})
-
-
-def _baseline(name: str, sensor: Sensor) -> Method:
-    """Return the method of a baseline: one without a network, or a file of codes as `compare` takes it."""
-    return codes_method(Path(name), sensor) if is_codes_file(name) else baseline(name)
 
 
 def _first_views(whole: Views, command: Evaluate) -> Views:

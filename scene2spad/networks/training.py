@@ -30,6 +30,7 @@ from csph.training.views import Views, is_seen, read_views, split_views
 from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.workers import check_workers
+from scene2spad.methods import code_of
 from scene2spad.networks.level_warnings import level_warnings
 from scene2spad.options.networks import Train, check_used
 from scenes.errors import InputError, require
@@ -322,12 +323,12 @@ def classical(name: str) -> Callable[[Tensor, Sensor], Tensor]:
     decoded by correlation, as in "fourier-8"."""
     if name in METHODS:
         return lambda counts, sensor: estimate_depth(counts, sensor, name)
-    code, _, number = name.rpartition("-")
-    numbered = code != "" and number.isascii() and number.isdigit()
-    require(numbered, f"baseline {name!r}: expected {', '.join(METHODS)}, CODE-K or codes in a file (.npy, .txt)")
+    code = code_of(name)
+    if code is None:
+        raise InputError(f"baseline {name!r}: expected {', '.join(METHODS)} or CODE-K")
 
     def compressive(counts: Tensor, sensor: Sensor) -> Tensor:
-        coding = _coding(code, int(number), sensor)
+        coding = _coding(*code, sensor)
         return decode_depth(encode(counts, coding), coding, sensor)
 
     return compressive

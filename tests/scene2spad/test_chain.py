@@ -16,7 +16,7 @@ from scenes.library.living_room import living_room
 from spad.detection.detect import sense
 from spad.detection.flux import expected_counts
 from spad.detection.rates import rates_for
-from spad.estimators.depth import depth_errors, estimate_depth
+from spad.estimators.depth import depth_errors, estimate_depth, histogram_depth_m
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -115,12 +115,11 @@ def test_flood_light_is_reported_beside_the_scan(capsys):
 
 @pytest.mark.parametrize("baseline", [(0.5, 0.0, 0.0), (0.0, 0.2, -0.3)])
 def test_displaced_laser_is_decoded_by_its_ellipsoid(baseline):
-    from scene2spad.cli.simulation.depth import depth_map
     from scenes.library.catalog import load_scene
 
     scene = replace(load_scene("plane", width=24, height=18), laser=Laser("flood", baseline, 120.0))
     transient = render(scene, RenderSettings(bounces=1))
     histogram = sense(transient, SENSOR, PhotonBudget(1e5, 0), seed=1, model="poisson")  # not pile-up: geometry
-    assert np.abs(depth_map(histogram, "log-matched") - transient.depth_m).max() < 1e-3
+    assert np.abs(histogram_depth_m(histogram, "log-matched") - transient.depth_m).max() < 1e-3
     with pytest.raises(InputError, match="co-located"):
         transient.delayed(1.0)

@@ -14,9 +14,9 @@ from csph.networks.model import load_model
 from csph.weights.shipped import shipped_file
 from render.engine import render
 from render.settings import RenderSettings
+from scene2spad import estimate_depth
 from scene2spad.bench import encode as bench_encode
 from scene2spad.cli import main
-from scene2spad.cli.simulation.depth import depth_map
 from scene2spad.studies import codes, memory, tensors
 from scenes import Laser
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
@@ -63,8 +63,7 @@ def test_decoded_table_holds_what_each_depth_map_gives(plane):
     assert len(rows) == 2 * len(names)
     for row in rows:
         histogram = next(h for h in histograms if h.budget.signal == row.signal)
-        method = "compressive" if row.codes else row.method
-        depth = depth_map(histogram, method, row.codes, row.method if row.codes else "fourier")
+        depth = estimate_depth(histogram, f"{row.method}-{row.codes}" if row.codes else row.method)
         errors = depth_errors(depth, histogram.depth_m, range_m=sensor.range_m, exclude=histogram.mixed)
         assert (row.mae_mm, row.pixels) == (pytest.approx(errors["mae_mm"]), errors["pixels"])
     best = {(r.method, r.codes): r.mae_mm for r in rows if r.signal == 1000}

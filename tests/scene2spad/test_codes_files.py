@@ -10,7 +10,7 @@ import pytest
 
 from render.transient import write_transient
 from render.transient.packs import write_pack
-from scene2spad import coding_tensor
+from scene2spad import coding_tensor, estimate_depth, sense
 from scene2spad.cli import main
 from scene2spad.datasets.planes import wall
 
@@ -41,6 +41,31 @@ def test_evaluate_takes_them_as_baselines(capfd):
     errors = {name: [row["mae_mm"] for row in rows if row["method"] == name] for name in ("fourier-8", "MINE.NPY")}
     assert errors["fourier-8"] == errors["MINE.NPY"] and len(errors["MINE.NPY"]) == 2
     assert sum(row["method"] == "mine.txt" for row in rows) == 2
+
+
+def test_random_codes_are_those_of_the_seed_in_every_command(capfd):
+    """`evaluate` had those of seed 0, under the same name as other codes of `compare`."""
+    np.save("drawn.npy", coding_tensor("random", 8, seed=5).temporal.numpy())
+    names = ["random-8", "drawn.npy"]
+    evaluate = ["evaluate", "none-s0", "--set", "walls.h5", "--levels", "50+1", "--out", "out", "--seed", "5", "--json"]
+    assert main([*evaluate, "--baselines", *names]) == 0
+    errors = json.loads(capfd.readouterr().out)["methods"]
+    assert main(["sense", "views/wall-2.exr", "--no-figure"]) == 0
+    capfd.readouterr()
+    assert main(["compare", "views/wall-2.h5", "--methods", *names, "--seed", "5", "--json"]) == 0
+    compared = json.loads(capfd.readouterr().out)["methods"]
+    first, second = ({key: row[key] for key in ("mae_mm", "rmse_mm")} for row in compared)
+    assert first == second and errors[names[0]]["all"]["all"] == errors[names[1]]["all"]["all"]
+
+
+def test_names_are_those_of_one_parser(capfd):
+    histogram = sense(wall(2.0, 4), signal=50, background=1)
+    np.save("drawn.npy", coding_tensor("fourier", 8).temporal.numpy())
+    assert np.array_equal(estimate_depth(histogram, "fourier-8"), estimate_depth(histogram, Path("drawn.npy")))
+    for name in ("none-s0", "fourier-x", "nosuch-8"):
+        assert main(["evaluate", "none-s0", "--set", "walls.h5", "--out", "out", "--baselines", name]) == 2
+        message = capfd.readouterr().err
+        assert f"method '{name}' is none of argmax, " in message and message.count("\n") == 1
 
 
 @pytest.mark.parametrize(

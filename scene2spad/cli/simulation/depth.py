@@ -291,13 +291,6 @@ def _check_model(command: Depth) -> None:
     require(shipped or not Path(model).exists(), f"--model {model!r}: {hint}")
 
 
-def depth_map(histogram: Histogram, method: str, codes: int = 16, code: str = "fourier", seed: int = 0) -> np.ndarray:
-    """Estimate depth [m] by a method's name, (H, W) float32; `compressive` keeps K codes of a temporal code."""
-    return depth_method(f"{code}-{codes}" if method == "compressive" else method, histogram.sensor, seed=seed)(
-        histogram
-    )
-
-
 def _chosen_method(command: Depth, sensor: Sensor) -> Method:
     """Return the method without a network that the options name."""
     if command.codes_file is not None:
