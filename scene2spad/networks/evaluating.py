@@ -26,9 +26,10 @@ from scene2spad.networks.end_warnings import warn_of_ends
 from scene2spad.networks.training import common_tile, network_method
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
-from scenes.files import write_csv
+from scenes.files import whole_file, write_csv
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
+from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")
 
@@ -52,7 +53,8 @@ def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
 
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
-    """Return networks and baselines on the same photons: one table (.csv), and the figures of the first checkpoint."""
+    """Return networks and baselines on the same photons: one table (.csv) with what it is of (.json), and the figures of the
+    first checkpoint."""
     levels, folder = photon_levels(command.levels), command.out / "maps"
     if command.maps:
         check_free(folder)
@@ -98,7 +100,25 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     shown["laws"] = found.laws()
     shown |= _counted(found, command.set, sensor.recorded_range_m) | _scenes_counted(command.set, views)
     shown |= {"overflows": sum(overflows), "csv": str(table)}
+    conditions = _conditions(command, views, sensor, tile)
+    with whole_file(table.with_suffix(".json")) as beside:
+        beside.write_text(json.dumps(conditions, indent=1) + "\n")
+    shown |= {"conditions": conditions} if command.json else {}
     return shown | ({"maps": str(folder)} if command.maps else {})
+
+
+def _conditions(command: Evaluate, views: Views, sensor: Sensor, tile: tuple[int, int]) -> JsonObject:
+    """Return what the numbers are of, beside the methods, scenes and levels that the table names."""
+    return {
+        "set": str(command.set),
+        "views": len(views.transients),
+        "offset_m": command.offset,
+        "sensor": sensor.name,
+        "seed": command.seed,
+        "law": command.law or "by level",
+        "decoder": command.decoder or "of each model",
+        "tile": list(tile),
+    }
 
 
 def _first_views(whole: Views, command: Evaluate) -> Views:

@@ -181,4 +181,4 @@ class Evaluate(Common):
     maps: bool = False
     """Write all depth maps as well, without confidence: maps/METHOD/VIEW-SCENE-SIGNAL+BACKGROUND.exr below --out."""
     out: Path = Path("out/evaluate")
-    """Folder for the table (.csv)."""
+    """Folder for the table (.csv), and for what it is of (.json)."""

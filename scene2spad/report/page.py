@@ -182,7 +182,11 @@ def _evaluations(one: Table, item: Item, found: Found, absent: dict[str, list[st
                 f"{count} {noun}{'s' * (count != 1)}"
                 for count, noun in ((summary.views, "view"), (summary.levels, "photon level"))
             )
-            tables.append(html.table(summary.rows, f"{one.shows}: {views} at {levels} ({found.place(path)})"))
+            beside = path.with_suffix(".json")
+            of = found.read(beside, read_json_object) if beside.is_file() else None
+            words = f"; {html.format_value(of)}" if of else ""
+            tables.append(html.table(summary.rows, f"{one.shows}: {views} at {levels}{words} ({found.place(path)})"))
+    found.newest(Path(one.file).with_suffix(".json").name)
     found.tables += len(tables)
     return "\n".join(tables) or _absent(one.file, item.command, newest, absent)
 

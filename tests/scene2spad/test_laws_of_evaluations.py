@@ -58,6 +58,17 @@ def evaluated(capfd, *options: str) -> tuple[dict, list[str], list[dict]]:
         return json.loads(out), err.splitlines(), list(csv.DictReader(file))
 
 
+def test_an_evaluation_says_what_it_is_of(capfd, walls):
+    """Of two offsets the tables were told apart by the folder's name alone."""
+    for offset_m, law in ((1.0, "auto"), (0.0, None)):
+        options = ("--offset", str(offset_m), "--seed", "4", "--decoder", "median", "--views", "1", "--tiled")
+        more = () if law is None else ("--law", law)
+        found, _, _ = evaluated(capfd, "--set", walls, "--levels", "50+1", *options, *more)
+        assert found["conditions"] == json.loads(Path("out/evaluation.json").read_text())
+        common = {"set": walls, "views": 1, "sensor": "reference", "seed": 4, "decoder": "median", "tile": [1, 1]}
+        assert found["conditions"] == common | {"offset_m": offset_m, "law": law or "by level"}
+
+
 def test_an_evaluation_says_its_law(capfd, walls):
     """200 background photons a pixel, 3,200 of which are in one: just below 1 % detections a cycle; 300 are above."""
     chosen = ("--set", walls, "--levels", "50+200", "50+300")

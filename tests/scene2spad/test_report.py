@@ -310,6 +310,7 @@ def test_means_of_every_evaluation_are_shown_with_their_places(tree, capfd):
     ]  # fmt: skip
     put(tree / "evaluate/near/evaluation.csv", head + "\n".join(lines) + "\n")
     put(tree / "evaluate/far/evaluation.csv", head + lines[0] + "\n", age=9)
+    put(tree / "evaluate/far/evaluation.json", json.dumps({"offset_m": 7.0, "decoder": "median", "tile": [4, 4]}))
     put(tree / "evaluate/other/evaluation.csv", "method,mae_mm\nargmax,3\n")
     message, text = made(tree, capfd)
     part = Page(text[text.index('<section id="evaluate"') :].partition("</section>")[0])
@@ -317,7 +318,9 @@ def test_means_of_every_evaluation_are_shown_with_their_places(tree, capfd):
     # mean of 20 and 113, not of three images
     assert "run/net.ckpt 66.5 267 74.5 62.5 0.875" in part.words and "argmax 67.5 267 75.5 62.5 0.875" in part.words
     assert "2 views at 2 photon levels (evaluate/near/evaluation.csv, 2023-11-14)" in part.words
-    assert "1 view at 1 photon level (evaluate/far/evaluation.csv" in part.words and "not shown" not in part.words
+    of = "offset_m: 7; decoder: median; tile: 4, 4"
+    assert f"1 view at 1 photon level; {of} (evaluate/far/evaluation.csv" in part.words
+    assert "not shown" not in part.words and "evaluation.json" not in text
     assert any(line.startswith("evaluate/other/evaluation.csv: cannot be read") for line in message["problems"])
 
 
