@@ -2,45 +2,53 @@
 
 from __future__ import annotations
 
-import os
+import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
 from matplotlib import pyplot as plt
-from PIL import Image
 
 from csph.levels import PHOTON_LEVELS as LEVELS
 from csph.training.views import read_views
 from render.transient import Transient
 from scene2spad.options.experiments import Bench
 from scene2spad.plots.figures import save
+from scenes.errors import InputError, require
+from scenes.io.relief import (
+    MIDDLEBURY_BASELINE_M,
+    MIDDLEBURY_FOCAL_PX,
+    MIDDLEBURY_SHRUNK,
+    middlebury_folder,
+    middlebury_names,
+    read_disparity,
+    read_luma,
+)
 from spad.detection.detect import sense
 from spad.estimators.depth import METHODS, estimate_depth, histogram_errors
 from spad.formats.rgbd import transient_from_rgbd
 from spad.sensor.model import PhotonBudget, Sensor
 
+log = logging.getLogger("scene2spad")
+
 QUICK_LEVELS = ((50, 50), (10, 1000))
-# Middlebury 2006 at half size: depth = 3740 px x 0.16 m / (disparity + dmin), focal length 1870 px
-DEPTH_SCALE_M = 3740 * 0.16
-FOCAL_PX = 1870.0
+FOCAL_PX = MIDDLEBURY_FOCAL_PX / MIDDLEBURY_SHRUNK
 BLOCK = 8  # image pixels a sensor pixel side
-LUMA = (0.2989, 0.5870, 0.1140)
 GROUPS = ("all", "unmixed", "mixed")
 
 
 def middlebury(folder: Path) -> Transient:
     """Return one Middlebury RGB-D pair as a transient of 8 x 8 returns a pixel; albedo and ambient light are its luma.
 
-    Cut to a whole number of pixels; samples without disparity return nothing.
+    Cut to a whole number of pixels; samples without disparity return nothing. Raises InputError as `read_disparity`
+    does.
     """
-    disparity = np.asarray(Image.open(folder / "disp1.png"), dtype=np.float64)
-    colour = np.asarray(Image.open(folder / "view1.png").convert("RGB"), dtype=np.float64) / 255
+    disparity, least = read_disparity(folder)
+    luma = read_luma(folder, (len(disparity), disparity.shape[1]))
     height, width = (side // BLOCK * BLOCK for side in disparity.shape)
-    disparity, luma = disparity[:height, :width], (colour @ LUMA)[:height, :width]
-    dmin = float((folder / "dmin.txt").read_text().strip())
-    depth = np.where(disparity > 0, DEPTH_SCALE_M / (disparity + dmin), np.nan)
+    disparity, luma = disparity[:height, :width], luma[:height, :width]
+    depth = np.where(disparity > 0, MIDDLEBURY_FOCAL_PX * MIDDLEBURY_BASELINE_M / (disparity + least), np.nan)
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     radial = depth * np.sqrt(1 + (x**2 + y**2) / FOCAL_PX**2)
     fov = 2 * np.degrees(np.arctan(width / 2 / FOCAL_PX))
@@ -74,18 +82,25 @@ def table(
 
 
 def scenes_of(command: Bench) -> list[tuple[str, Transient]]:
-    """Return views of the rendered set that is asked for, else the Middlebury images of the data folder; none without
-    both.
+    """Return views of the rendered set that is asked for, else the Middlebury images of the data folder; none, and a
+    warning, without both.
 
-    Only the first where it is to be quick. Raises InputError as `read_views` does.
+    Only the first where it is to be quick. Raises InputError as `read_views` and `middlebury` do, and for a given data
+    folder without images.
     """
     most = 1 if command.quick else None
     if command.set is not None:
         views = read_views(command.set)
         return list(zip(views.scenes, views.transients, strict=True))[:most]
-    data = command.data or Path(os.environ.get("SCENE2SPAD_DATA", "../shared/data"))
-    folders = sorted(path.parent for path in (data / "middlebury").glob("*/disp1.png"))
-    return [(folder.name, middlebury(folder)) for folder in folders[:most]]
+    try:
+        names = middlebury_names(command.data)
+        require(bool(names), f"{middlebury_folder('', command.data)}: holds no Middlebury scene (NAME/disp1.png)")
+    except InputError as error:
+        if command.data is not None:
+            raise
+        log.warning("%s; the table of estimators is left out", error)
+        return []
+    return [(name, middlebury(middlebury_folder(name, command.data))) for name in names[:most]]
 
 
 def mean_over(rows: list[dict], key: str, **where: object) -> float:

@@ -39,8 +39,8 @@ from scenes.io.relief import (
     middlebury_folder,
     middlebury_names,
     read_disparity,
+    read_luma,
 )
-from scenes.io.textures import opened_image
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.formats.rgbd import PUBLISHED_SPEED_OF_LIGHT_M_PER_S, published_from_rgbd
@@ -50,7 +50,6 @@ from spad.sensor.model import PhotonBudget, Sensor
 log = logging.getLogger("scene2spad")
 
 SCENES = 8  # of the published test set
-LUMA = (0.2989, 0.5870, 0.1140)
 SHRINK, PAD_TO = 8, 64
 PADLESS_M = 1.962  # of the wall seen through Bowling1's large hole
 
@@ -147,12 +146,8 @@ def _pair(folder: Path) -> Pair:
     if folder.name == "Bowling1":
         hole = binary_dilation(binary_erosion(~known, _disk(3)), _disk(20)) & ~known
         depth = np.where(hole, PADLESS_M, depth)
-    with opened_image(folder / "view1.png") as image:
-        same = (image.height, image.width) == disparity.shape
-        rows, columns = disparity.shape
-        require(same, f"{image.width} x {image.height} pixels, disp1.png has {columns} x {rows}")
-        luma = np.asarray(image.convert("RGB"), np.float64) @ LUMA / 255
-    return Pair(folder.name, _shrunk(depth), np.clip(_shrunk(luma), 0, None))
+    luma = _shrunk(read_luma(folder, (len(disparity), disparity.shape[1])))
+    return Pair(folder.name, _shrunk(depth), np.clip(luma, 0, None))
 
 
 def _disk(radius: int) -> np.ndarray:

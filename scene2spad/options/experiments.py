@@ -41,7 +41,8 @@ class Bench(Common):
     memory: bool = False
     """Compare peak memory in fresh processes instead."""
     data: Annotated[Path | None, may_stay_open("FOLDER")] = None
-    """Folder with the artist's scene and the Middlebury images (default: SCENE2SPAD_DATA, else ../shared/data)."""
+    """Folder with the artist's scene and the Middlebury images (default: SCENE2SPAD_DATA, else shared/data beside
+    the project)."""
     set: Annotated[Path | None, may_stay_open("SET")] = None
     """Rendered set whose views the estimators of `bench sense` are compared on (default: the Middlebury images)."""
     cache: Annotated[Path | None, may_stay_open("FOLDER")] = None

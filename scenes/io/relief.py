@@ -22,6 +22,7 @@ from scenes.model import Camera, Material, Scene, Surface, Texture
 # Middlebury 2006: focal length [px] of the full-size images, baseline [m]; the files are half-size, and hold
 # disparities of the full size.
 MIDDLEBURY_FOCAL_PX, MIDDLEBURY_BASELINE_M, MIDDLEBURY_SHRUNK = 3740.0, 0.160, 2
+LUMA = (0.2989, 0.5870, 0.1140)  # of the published simulations
 # Neighbours whose depths differ by more than a slope of 85 degrees, and by more than quantisation explains, are apart.
 CUT_SLOPE, CUT_LEVELS = math.tan(math.radians(85)), 2.5
 HAIR_PX = 2e-3
@@ -202,20 +203,24 @@ def _opposite(image: np.ndarray, span: int, axis: int) -> tuple[np.ndarray, np.n
 # --- Files -----------------------------------------------------------------------------------------------------------
 
 
-def middlebury_folder(name: str) -> Path:
-    """Return where the scenes of Middlebury 2006 lie: $SCENE2SPAD_DATA/middlebury, else shared/data beside the
-    project."""
-    data = Path(os.environ.get(DATA_VARIABLE) or Path(__file__).parents[3] / "shared" / "data")
-    folder = data / "middlebury" / name
+def data_folder(given: Path | None = None) -> Path:
+    """Return where data that come without the project lie: the folder given, $SCENE2SPAD_DATA, or shared/data beside
+    the project."""
+    return given or Path(os.environ.get(DATA_VARIABLE) or Path(__file__).parents[3] / "shared" / "data")
+
+
+def middlebury_folder(name: str, data: Path | None = None) -> Path:
+    """Return where the scenes of Middlebury 2006 lie: `middlebury` in the data folder."""
+    folder = data_folder(data) / "middlebury" / name
     require(
         folder.is_dir(), f"middlebury/{name}: folder {folder} not found; set {DATA_VARIABLE} to what holds middlebury/"
     )
     return folder
 
 
-def middlebury_names() -> list[str]:
+def middlebury_names(data: Path | None = None) -> list[str]:
     """Return the Middlebury scenes that are there, sorted."""
-    parent = middlebury_folder("")
+    parent = middlebury_folder("", data)
     return sorted(path.name for path in parent.iterdir() if (path / "disp1.png").is_file())
 
 
@@ -255,6 +260,17 @@ def read_disparity(folder: Path) -> tuple[np.ndarray, float]:
     except (ValueError, IndexError):
         raise InputError(f"{folder / 'dmin.txt'}: holds no number") from None
     return read_levels(folder / "disp1.png"), least
+
+
+def read_luma(folder: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Return the luma of view1.png (h, w), 0 to 1, of a Middlebury scene whose disparities are of that shape.
+
+    Raises InputError naming the file for another size, and one that cannot be read.
+    """
+    with opened_image(folder / "view1.png") as image:
+        same = (image.height, image.width) == shape
+        require(same, f"{image.width} x {image.height} pixels, disp1.png has {shape[1]} x {shape[0]}")
+        return np.asarray(image.convert("RGB"), np.float64) @ LUMA / 255
 
 
 def rgbd(files: RgbdFiles, *, width: int | None = None, height: int | None = None) -> Scene:

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import re
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -271,10 +273,25 @@ def test_deviations_from_closed_forms_are_of_the_law_that_drew_the_counts():
     assert max_deviation(counts[:, ::-1], first_photon_totals(flux, 2000)) > 10
 
 
+def test_a_data_folder_without_its_images_is_refused(tmp_path, capfd, shared_data):
+    """The table of estimators was left out without a word."""
+    odd = tmp_path / "odd/middlebury/Art"
+    shutil.copytree(shared_data / "middlebury/Art", odd)
+    (odd / "dmin.txt").write_text("many")
+    (tmp_path / "empty/middlebury").mkdir(parents=True)
+    words = {"nosuch": "folder .*middlebury not found", "empty": "holds no Middlebury scene", "odd": "holds no number"}
+    for data, word in words.items():
+        argv = ["bench", "sense", "--quick", "--data", str(tmp_path / data), "--out", str(tmp_path / "b")]
+        assert main(argv) == 2
+        message = capfd.readouterr().err
+        assert re.search(word, message) and message.count("\n") == 1 and not (tmp_path / "b").exists()
+
+
 @pytest.mark.slow
-def test_bench_sense(tmp_path, capfd):
-    status, message, _ = run(capfd, "bench", "sense", "--quick", "--out", str(tmp_path / "b"), "--data", str(tmp_path))
-    assert status == 0 and "estimators" not in message
+def test_bench_sense(tmp_path, capfd, monkeypatch):
+    monkeypatch.setenv("SCENE2SPAD_DATA", str(tmp_path))
+    status, message, told = run(capfd, "bench", "sense", "--quick", "--out", str(tmp_path / "b"))
+    assert status == 0 and "estimators" not in message and "the table of estimators is left out" in told
     names = [row["name"] for row in message["rows"]]
     assert sum("numpy" in name for name in names) == 2 and any("training batch" in name for name in names)
     assert all(row["same_law_p"] is None or row["same_law_p"] > 1e-4 for row in message["rows"])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError
+from scenes.io.relief import data_folder
 from scenes.library.catalog import load_scene
 from scenes.model import Ambient, Laser, Material, Scene, Surface
 
@@ -98,12 +98,6 @@ def reference_passes(transport: str, size: int) -> tuple[int, int]:
     wanted = next((n for limit, n in spp.items() if size <= limit), 256)
     a_pass = max(1, min(wanted, (1 << 24) // size**2))
     return -(-wanted // a_pass), a_pass
-
-
-def data_folder(given: Path | None) -> Path:
-    """Return where the data for checks lies: the option, SCENE2SPAD_DATA, or ../shared/data beside the working
-    folder."""
-    return given or Path(os.environ.get("SCENE2SPAD_DATA", "../shared/data"))
 
 
 def bench_scene(name: str, size: int, data: Path | None = None) -> Scene:
