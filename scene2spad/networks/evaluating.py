@@ -53,8 +53,8 @@ def photon_levels(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
 
 
 def run_evaluate(command: Evaluate, progress: Progress) -> dict:
-    """Return networks and baselines on the same photons: one table (.csv) with what it is of (.json), and the figures of
-    the first checkpoint."""
+    """Return networks and baselines on the same photons: one table (.csv) with what it is of (.json), and the figures
+    of the first checkpoint."""
     levels, folder = photon_levels(command.levels), command.out / "maps"
     if command.maps:
         check_free(folder)

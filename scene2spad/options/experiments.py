@@ -30,7 +30,7 @@ class Bench(Common):
     only: tuple[str, ...] = ()
     """Cases of `bench hard-cases`, or programs of `bench emulate` (default: all)."""
     quick: bool = False
-    """No 256 pixels, and flash and lamp alone at 128; no slow hard cases."""
+    """No 256 pixels, and flash and lamp alone at 128; two levels of one image; no slow hard cases or megapixels."""
     peer: Literal["mitransient", "none"] = "mitransient"
     """The renderer beside ours; none measures ours alone, against its own finer results."""
     repeats: int = 3
@@ -39,7 +39,7 @@ class Bench(Common):
     seeds: int = 3
     """Runs of different seeds that the error is averaged over."""
     memory: bool = False
-    """Compare peak memory in fresh processes instead."""
+    """Compare peak memory of one scene and size in fresh processes instead."""
     data: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder with the artist's scene and the Middlebury images (default: SCENE2SPAD_DATA, else shared/data beside
     the project)."""
@@ -56,6 +56,8 @@ STAGES_OF: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("scenes", "sizes", "peer", "seeds", "memory", "cache"), ("render",)),
     "only": ("hard-cases", "emulate"),
     "data": ("render", "sense"),
+    "quick": ("render", "sense", "network", "emulate", "hard-cases"),
+    "repeats": ("render", "sense", "encode", "network", "emulate"),
     "set": ("sense",),
 }
 ABLATIONS = ("spatial-block", "tensor-size", "fourier")

@@ -295,9 +295,8 @@ def test_bench_of_ours_alone(capfd, tmp_path, few_qualities):
 
 def test_memory_is_measured_in_processes_of_its_own(capfd, tmp_path):
     argv = ("--memory", "--scenes", "groove", "--sizes", "16", "--peer", "none")
-    status, result, err = bench(capfd, tmp_path, *argv)
-    assert status == 0, err
-    peaks = result["peak_mb_above_imports"]
+    assert main(["bench", "render", *argv, "--json"]) == 0
+    peaks = json.loads(capfd.readouterr().out)["peak_mb_above_imports"]
     assert peaks.keys() == {"ours unbiased", "ours filtered"} and all(0 < peak < 2000 for peak in peaks.values())
 
 
@@ -327,6 +326,14 @@ def test_mistakes_end_in_one_line(capfd, tmp_path, argv, message):
     assert status == 2 and message in err and "Traceback" not in err
 
 
+def test_a_megapixel_is_timed_of_the_programs_that_are_asked_for(tmp_path, monkeypatch):
+    timed = []
+    monkeypatch.setattr("scene2spad.bench.emulate.time_megapixel", lambda chosen, *_: timed.append(chosen.name) or {})
+    for name in ("fourier-8", "separable-16"):
+        assert main(["bench", "emulate", "--only", name, "--repeats", "1", "--out", str(tmp_path)]) == 0
+    assert timed == ["separable-16"]
+
+
 def test_absent_mitransient_ends_in_one_line(capfd, tmp_path, monkeypatch):
     monkeypatch.setattr("scene2spad.bench.rendering.peers.available", lambda: False)
     status, _, err = bench(capfd, tmp_path, "--scenes", "groove", "--sizes", "8")
@@ -338,6 +345,11 @@ def test_absent_mitransient_ends_in_one_line(capfd, tmp_path, monkeypatch):
     [
         (["sense", "--sizes", "64"], "bench sense: --sizes 64 is for render"),
         (["encode", "--memory"], "bench encode: --memory is for render"),
+        (["encode", "--quick"], "bench encode: --quick is for render and sense and network and emulate and hard-cases"),
+        (["hard-cases", "--repeats", "5"], "bench hard-cases: --repeats 5 is for render and sense and encode"),
+        (["render", "--memory", "--seeds", "5"], "bench render --memory: --seeds 5 is for the bench without --memory"),
+        (["render", "--memory", "--out", "here"], "bench render --memory: --out here is for the bench without"),
+        (["render", "--memory", "--sizes", "16", "32"], "bench render --memory: --sizes 16 32: expected one"),
         (["network", "--only", "fourier-16"], "bench network: --only fourier-16 is for hard-cases and emulate"),
     ],
 )

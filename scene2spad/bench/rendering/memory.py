@@ -10,17 +10,25 @@ from pathlib import Path
 
 from scene2spad.bench.rendering import ours, peers, settings
 from scene2spad.bench.rendering.settings import BIN_M, BINS, BOUNCES, METHODS
+from scene2spad.options.common import only_for
 from scene2spad.options.experiments import Bench
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.progress import Progress
 
 SIZE, SPP = 256, 64
+OF_TIMES = ("repeats", "seeds", "quick", "seed", "cache", "out")  # options that mean nothing here
 
 
 def run(command: Bench, progress: Progress) -> dict:
-    """Run the bench: one process a method, 256 x 256 pixels (or the first of --sizes), 64 samples a pixel, full
-    transport."""
-    scene, size = (command.scenes or ("flash",))[0], (command.sizes or (SIZE,))[0]
+    """Run the bench: one process a method, 256 x 256 pixels (or those of --sizes), 64 samples a pixel, full transport.
+
+    Raises InputError for options of the comparison of times, and more than one scene or size.
+    """
+    only_for(command, "bench render --memory", dict.fromkeys(OF_TIMES, (False, "the bench without --memory")))
+    for name, given in (("scenes", command.scenes), ("sizes", command.sizes)):
+        words = " ".join(map(str, given))
+        require(len(given) <= 1, f"bench render --memory: --{name} {words}: expected one, memory is measured of one")
+    (scene,), (size,) = command.scenes or ("flash",), command.sizes or (SIZE,)
     methods = list(METHODS["full"])
     if command.peer == "none" or not peers.available():
         methods = [m for m in methods if m.code == "ours"]
