@@ -87,8 +87,10 @@ def main(argv: list[str]) -> int:
         return _refuse(str(error))
     except OSError as error:
         return _refuse(f"{error.filename or 'file system'}: {error.strerror or error}")
-    except MemoryError:
-        return _refuse("out of memory: use a smaller image or fewer samples")
+    except (MemoryError, RuntimeError) as error:
+        if not _is_out_of_memory(error):
+            raise
+        return _refuse("out of memory: use a smaller image or batch, or fewer samples")
     except KeyboardInterrupt:
         print(STOPPED, file=sys.stderr)
         return 130
@@ -100,6 +102,13 @@ def main(argv: list[str]) -> int:
         sys.stdout = None
         return _refuse(f"standard output: {error.strerror or error}")
     return 0
+
+
+def _is_out_of_memory(error: MemoryError | RuntimeError) -> bool:
+    """Tell whether memory ran out: PyTorch has an error of its own for GPUs, and only a message for the processor."""
+    torch = sys.modules.get("torch")
+    on_gpu = torch is not None and isinstance(error, torch.cuda.OutOfMemoryError)
+    return isinstance(error, MemoryError) or on_gpu or "can't allocate memory" in str(error)
 
 
 def options_of(name: str) -> type[Common]:

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from processes import run_process
 
 from render.transient import read_transient
@@ -248,6 +249,35 @@ def test_interrupt_ends_with_its_own_status(capfd, folder, monkeypatch):
     monkeypatch.setattr("render.engine.render", stop)
     status, out, err = run(capfd, "render", "sphere", *SMALL)
     assert status == 130 and out == "" and "interrupted" in err and list(folder.iterdir()) == []
+
+
+def raising(error: Exception):
+    """Stand in for a renderer that ends in an error."""
+
+    def render(*_, **__):
+        raise error
+
+    return render
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.\nGPU 0 has"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory"),
+    ],
+)
+def test_memory_that_runs_out_is_one_line(capfd, folder, monkeypatch, error):
+    """PyTorch's errors are of another kind than Python's."""
+    monkeypatch.setattr("render.engine.render", raising(error))
+    assert "out of memory: use a smaller image" in refused(capfd, "render", "plane", "--out", "p.exr")
+
+
+def test_other_errors_of_the_program_are_not_hidden(folder, monkeypatch):
+    monkeypatch.setattr("render.engine.render", raising(RuntimeError("a mistake of ours")))
+    with pytest.raises(RuntimeError, match="a mistake of ours"):
+        main(["render", "plane", "--out", "p.exr"])
 
 
 def test_a_scene_with_a_slash_in_its_name_gets_a_file_in_this_folder(folder, capfd):

@@ -40,6 +40,13 @@ def test_a_transient_and_the_returns_of_a_pixel(files, capfd):
     assert [one["radiance_per_m2_sr"] for one in found["pixel"]["returns"]] == transient.radiance[mine].tolist()
 
 
+def test_a_delay_is_shown(files, capfd, tmp_path):
+    argv = ["render", "plane", "--width", "8", "--bounces", "1", "--offset", "2.5", "--no-figure"]
+    assert main([*argv, "--out", str(tmp_path / "late.exr")]) == 0
+    assert message(capfd, tmp_path / "late.exr")["time_offset_m"] == 2.5
+    assert "time_offset_m" not in message(capfd, files / "gallery.exr")
+
+
 def test_a_histogram_and_the_counts_of_a_pixel(files, capfd):
     found, histogram = message(capfd, files / "gallery.h5", "--pixel", 5, 7), read_histogram(files / "gallery.h5")
     assert (found["kind"], found["bins"], found["sensor"]) == ("histogram", 1024, "reference")

@@ -132,7 +132,7 @@ def _of_transient(transient: Transient) -> dict[str, object]:
         "indirect_fraction": transient.indirect_fraction,
         "mixed_fraction": float(transient.mixed.mean()),
         "ambient_W_per_m2_sr_nm": _range(transient.ambient),
-        **_known(meta, ("seed", "offset", "offset_mode", "relative_error", "plan", "versions")),
+        **_known(meta, ("seed", "time_offset_m", "relative_error", "plan", "versions")),
     }
 
 
