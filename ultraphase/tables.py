@@ -98,6 +98,16 @@ def coarse_matrix(codes: int, timestamps: int) -> np.ndarray:
     return (np.arange(timestamps) * codes // timestamps == np.arange(codes)[:, None]).astype(np.int64)
 
 
+def by_block(sums: np.ndarray, block: tuple[int, int], codes: int) -> np.ndarray:
+    """Gather what the cores of an array hold by the blocks whose cores `spatial_sum` and `block_sum` add up.
+
+    sums (H, W, blocks * K) -> (H / rows, W / columns, cores, blocks, K).
+    """
+    (height, width), (rows, columns) = sums.shape[:2], block
+    cores = sums.reshape(height // rows, rows, width // columns, columns, -1, codes).swapaxes(1, 2)
+    return cores.reshape(height // rows, width // columns, rows * columns, -1, codes)
+
+
 def spatial_sum(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the frame end of 2 x 2 cores (`sum2x2.s`): sum over the cores of w s / 128, rounded (halves up), then
     saturated to 16 bits.

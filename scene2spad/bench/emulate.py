@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -14,19 +13,15 @@ from scene2spad.emulation.emulated_chain import timestamps_of
 from scene2spad.emulation.program_tables import int8_temporal
 from scene2spad.options.experiments import Bench
 from scenes.errors import require
-from scenes.files import whole_file
+from scenes.files import write_csv
 from scenes.progress import Progress
 from scenes.random_streams import Stream
 from ultraphase import Core, CoreArray, Method, method, verify
 from ultraphase.catalog import PUBLISHED, TIMESTAMPS
-from ultraphase.tables import INT8_SCALE, spatial_sum
+from ultraphase.tables import INT8_SCALE, by_block, spatial_sum
 from ultraphase.verify import Tabulated
 
 T = TypeVar("T")
-COLUMNS = (
-    *("name", "seconds", "cpu_seconds", "error", "pixels", "photons"),
-    *("instructions_per_second", "photons_per_second"),
-)
 MEGAPIXEL = 1 << 20
 PHOTONS = 550
 _MEGAPIXEL_PROGRAMS = ("fourier-16", "separable-16")
@@ -49,12 +44,7 @@ def run(command: Bench, progress: Progress) -> dict:
         large = [name for name in _MEGAPIXEL_PROGRAMS if name in names]
         rows += [time_megapixel(method(name), command.seed, command.repeats) for name in large]
     out.mkdir(parents=True, exist_ok=True)
-    path = out / "bench-emulate.csv"
-    with whole_file(path) as beside, beside.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
-    return {"rows": rows, "out": str(path)}
+    return {"rows": rows, "out": str(write_csv(rows, out / "bench-emulate.csv"))}
 
 
 def _clocks() -> np.ndarray:
@@ -120,10 +110,9 @@ def _left(chosen: Method, sums: np.ndarray, shape: tuple[int, int] = (16, 32)) -
     """Compute the numbers that leave the sensor from those that the cores hold, in the order of the array."""
     if chosen.block == (1, 1):
         return sums
-    (down, right), (height, width) = chosen.block, shape
-    cores = sums.reshape(height // down, down, width // right, right, -1, chosen.codes).swapaxes(1, 2)
-    cores = cores.reshape(height // down * width // right, down * right, -1, chosen.codes)
-    return spatial_sum(cores, np.full((down * right, chosen.codes), INT8_SCALE)).reshape(len(cores), -1)
+    cores = by_block(sums.reshape(*shape, -1), chosen.block, chosen.codes)
+    weights = np.full((cores.shape[2], chosen.codes), INT8_SCALE)
+    return spatial_sum(cores, weights).reshape(cores.shape[0] * cores.shape[1], -1)
 
 
 def _row(

@@ -3,9 +3,7 @@ of encoding photon timestamps with and without building a histogram. Same tensor
 
 from __future__ import annotations
 
-import csv
 import importlib.metadata
-import io
 import json
 import os
 import platform
@@ -27,7 +25,7 @@ from csph.codes.blocks import EPSILON
 from csph.codes.photons import encode_photons, photon_table
 from scene2spad.options.experiments import Bench
 from scenes.errors import require
-from scenes.files import whole_file
+from scenes.files import whole_file, write_csv
 from scenes.progress import Progress
 from spad.measurements.histogram import counts_from_timestamps
 
@@ -213,10 +211,6 @@ def _line(row: Row) -> str:
 
 
 def _write(rows: list[Row], folder: Path) -> dict[str, str]:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [*Row.__dataclass_fields__], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
     machine = {
         "processor": platform.processor() or platform.machine(),
         "cpus": os.cpu_count(),
@@ -224,8 +218,7 @@ def _write(rows: list[Row], folder: Path) -> dict[str, str]:
         "versions": {name: importlib.metadata.version(name) for name in ("scene2spad", "torch")},
     }
     names = {key: str(folder / f"bench-encode.{ending}") for key, ending in (("csv", "csv"), ("results", "json"))}
-    with whole_file(Path(names["csv"])) as beside:
-        beside.write_text(text.getvalue())
+    write_csv([asdict(row) for row in rows], Path(names["csv"]))
     with whole_file(Path(names["results"])) as beside:
         beside.write_text(json.dumps({"rows": [asdict(row) for row in rows], "machine": machine}, indent=1) + "\n")
     return {**names, "figure": str(_draw(rows, folder / "bench-encode.png"))}

@@ -5,7 +5,6 @@ The tests run the same table, one test a case.
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 from collections.abc import Iterable
@@ -17,13 +16,12 @@ from scene2spad.bench.hard import optics as hard_cases_optics
 from scene2spad.bench.hard.case import Case, Measured
 from scene2spad.options.experiments import Bench
 from scenes.errors import InputError, require
-from scenes.files import whole_file
+from scenes.files import write_csv
 from scenes.progress import Progress
 
 CASES: dict[str, Case] = {
     case.name: case for case in (*hard_cases_direct.CASES, *hard_cases_indirect.CASES, *hard_cases_optics.CASES)
 }
-COLUMNS = ("name", "passed", "quantity", "error", "limit", "seconds", "clipped", "oracle")
 
 
 def run(command: Bench, progress: Progress) -> dict:
@@ -83,13 +81,18 @@ def row(case: Case, seed: int) -> dict:
 def _write(out: Path, rows: list[dict]) -> Path:
     """Write the table as CSV, one line a quantity; whole or not at all."""
     out.mkdir(parents=True, exist_ok=True)
-    path = out / "bench-hard-cases.csv"
-    with whole_file(path) as beside, beside.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for one in rows:
-            for quantity, (error, limit) in one["quantities"].items():
-                passed = Measured(error, limit).fraction <= 1
-                shown = [f"{value:.4g}" for value in (error, limit, one["seconds"])]
-                writer.writerow((one["name"], passed, quantity, *shown, one["clipped"], one["oracle"]))
-    return path
+    lines = [
+        {
+            "name": one["name"],
+            "passed": Measured(error, limit).fraction <= 1,
+            "quantity": quantity,
+            "error": f"{error:.4g}",
+            "limit": f"{limit:.4g}",
+            "seconds": f"{one['seconds']:.4g}",
+            "clipped": one["clipped"],
+            "oracle": one["oracle"],
+        }
+        for one in rows
+        for quantity, (error, limit) in one["quantities"].items()
+    ]
+    return write_csv(lines, out / "bench-hard-cases.csv")

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import importlib.metadata
-import io
 import json
 import logging
-import math
 import os
 import platform
 from collections.abc import Callable
@@ -25,7 +22,7 @@ from scene2spad.bench.rendering.references import default_folder, reference
 from scene2spad.bench.rendering.settings import BIN_M, BINS, BOUNCES, METHODS
 from scene2spad.options.experiments import Bench
 from scenes.errors import InputError
-from scenes.files import whole_file
+from scenes.files import finite, whole_file, write_csv
 from scenes.model import Scene
 from scenes.progress import Progress
 
@@ -34,7 +31,6 @@ log = logging.getLogger("scene2spad")
 TARGETS = {"direct": (0.0123, 0.003), "full": ()}  # beside the best error that the peer was measured at
 OWN_REFERENCE_GRID = 16
 SEEDS_APART = 10_000_000  # runs of one --seed never meet those of another, nor the reference's
-COLUMNS = tuple(Row.__dataclass_fields__)
 
 
 @dataclass(frozen=True)
@@ -72,7 +68,7 @@ def run(command: Bench, progress: Progress) -> dict:
     result: dict[str, object] = {"rows": [row.to_dict() for row in rows], "ratios": ratios, "checks": checks}
     result |= _write(rows, command)
     with whole_file(command.out / "bench-render.json") as beside:
-        text = json.dumps(_plain({**result, "machine": _machine(with_peer)}), indent=1, allow_nan=False)
+        text = json.dumps(finite({**result, "machine": _machine(with_peer)}), indent=1, allow_nan=False)
         beside.write_text(text + "\n")
     if not command.json:
         shown = [r for r in ratios if "multijitter" in r["theirs"] and r["chief"]]
@@ -228,26 +224,11 @@ def _ratios(rows: list[Row]) -> list[dict]:
 def _write(rows: list[Row], command: Bench) -> dict:
     from scene2spad.bench.rendering import picture
 
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row.to_dict() for row in rows)
-    path = command.out / "bench-render.csv"
-    with whole_file(path) as beside:
-        beside.write_text(text.getvalue())
+    path = write_csv([row.to_dict() for row in rows], command.out / "bench-render.csv")
     names = {"csv": str(path), "results": str(command.out / "bench-render.json")}
     for key, kind in (("figure", "raw"), ("figure_pulse", "pulse")):
         names[key] = str(picture.draw(rows, kind, command.out / f"bench-render-{kind}.png"))
     return names
-
-
-def _plain(value: object) -> object:
-    """JSON knows neither NaN nor infinity: null instead."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _machine(with_peer: bool) -> dict:

@@ -13,9 +13,6 @@ from scenes.limits import memory_limit
 T = TypeVar("T")
 
 
-Made = TypeVar("Made")
-
-
 class Cost(NamedTuple):
     """Seconds that a trial took, by the clock and of the processors."""
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from csph import CodingTensor, decode_depth, encode
+from csph.codes.quantise import wrapped_sums
 from scene2spad.emulation.program_tables import fixed_spatial, int8_temporal
 from scenes.errors import require
 from spad.measurements.histogram import Histogram
@@ -20,10 +21,9 @@ from spad.sensor.model import Sensor
 from ultraphase import CoreArray, Method
 from ultraphase.catalog import TIMESTAMPS
 from ultraphase.core import Counters
-from ultraphase.tables import spatial_sum
+from ultraphase.tables import by_block, spatial_sum
 
 _CORES = 1 << 16  # emulated at a time
-INT16 = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +40,13 @@ class Emulated:
     bits: int
 
 
-def emulate(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> Emulated:
+def emulate(counts: np.ndarray, method: Method) -> Emulated:
     """Return one frame of an image, every photon a timestamp that a core's program works on.
 
-    counts   (H, W, 1024) integers; H and W are multiples of the method's block
-    spatial  (rows, columns, K) int8 weights of one block of cores, else `fixed_spatial`
+    counts (H, W, 1024) integers; H and W are multiples of the method's block.
     """
     height, width = _blocks_fit(counts, method)
-    spatial = fixed_spatial(method) if spatial is None else spatial
+    spatial = fixed_spatial(method)
     program, tables = method.program(), method.tables(int8_temporal(method))
     rows = max(_CORES // width // method.block[0], 1) * method.block[0]
     codes, counters, bits = [], [], 0
@@ -82,37 +81,33 @@ def _blocks_fit(counts: np.ndarray, method: Method) -> tuple[int, int]:
     return height, width
 
 
-def by_torch(counts: np.ndarray, method: Method, spatial: np.ndarray | None = None) -> np.ndarray:
+def by_torch(counts: np.ndarray, method: Method) -> np.ndarray:
     """Return the same numbers without a program: csph's `encode` with the int8 tensor, and the limits of the number
     format.
 
     Raises InputError where a sum is so large that float32 does not hold it exactly.
     """
-    height, width = _blocks_fit(counts, method)
-    spatial = fixed_spatial(method) if spatial is None else spatial
+    _blocks_fit(counts, method)
+    spatial = fixed_spatial(method)
     matrix = torch.from_numpy(method.matrix(int8_temporal(method))).float()
     largest = int(counts.sum(axis=-1, dtype=np.int64).max(initial=0)) * int(matrix.abs().max())
     require(largest < 1 << 24, f"sums up to {largest} are not exact in float32")
-    sums = encode(torch.from_numpy(counts), CodingTensor(method.name, matrix)).numpy().astype(np.int64)
+    sums = encode(torch.from_numpy(counts), CodingTensor(method.name, matrix)).long()
     if method.family == "coarse":
-        return np.minimum(sums, 255)
-    sums = (sums + INT16) % (2 * INT16) - INT16
+        return np.minimum(sums.numpy(), 255)
+    held = wrapped_sums(sums).numpy()
     if spatial is None:
-        return sums
-    down, right = method.block
-    cores = sums.reshape(height // down, down, width // right, right, -1, method.codes).swapaxes(1, 2)
-    cores = cores.reshape(height // down, width // right, down * right, -1, method.codes)
-    summed = spatial_sum(cores, spatial.reshape(down * right, method.codes))
-    return summed.reshape(height // down, width // right, -1)
+        return held
+    summed = spatial_sum(by_block(held, method.block, method.codes), spatial.reshape(-1, method.codes))
+    return summed.reshape(*summed.shape[:2], -1)
 
 
-def decode(codes: np.ndarray, method: Method, sensor: Sensor, spatial: np.ndarray | None = None) -> np.ndarray:
+def decode(codes: np.ndarray, method: Method, sensor: Sensor) -> np.ndarray:
     """Return depth [m] of every pixel from what the cores put out, (H, W) float32, by csph's correlation decoder.
 
     The codes of a block answer to a pulse in its pixel p with w[p, k] C[k, t]: that matrix is pixel p's coding tensor.
     """
-    matrix = method.matrix(int8_temporal(method))
-    spatial = fixed_spatial(method) if spatial is None else spatial
+    matrix, spatial = method.matrix(int8_temporal(method)), fixed_spatial(method)
     found = torch.from_numpy(codes).float()
     down, right = method.block
     depth = np.empty((codes.shape[0] * down, codes.shape[1] * right), np.float32)

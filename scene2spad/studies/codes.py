@@ -6,8 +6,6 @@ uncompressed histogram, and its Cramer-Rao bound.
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import math
 from collections.abc import Iterable, Iterator
@@ -32,7 +30,7 @@ from scene2spad.plots.figures import save
 from scenes import Laser
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require
-from scenes.files import whole_file
+from scenes.files import write_csv
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 from spad.detection.detect import sense
@@ -195,13 +193,7 @@ def run(command: Study, progress: Progress) -> dict:
     command.out.mkdir(parents=True, exist_ok=True)
     size = f"{scene.name} {scene.camera.width} x {scene.camera.height}, direct light alone, scanned"
     figure = draw(groups, size, command.out / "codes.png")
-    table = command.out / "codes.csv"
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [*Row.__dataclass_fields__], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    with whole_file(table) as beside:
-        beside.write_text(text.getvalue())
+    table = write_csv([asdict(row) for row in rows], command.out / "codes.csv")
     shown = {"rows": [asdict(row) for row in rows], "groups": groups} if command.json else {"groups": _lines(groups)}
     return {"scene": size, **shown, "csv": str(table), "figures": [str(figure)]}
 

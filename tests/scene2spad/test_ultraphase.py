@@ -185,13 +185,14 @@ def test_a_load_that_cannot_be_is_refused_before_the_programs_run(capfd, folder,
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_emulated_codes_are_the_torch_paths_and_give_depth(name):
+def test_emulated_codes_are_the_torch_paths_and_give_depth(name, monkeypatch):
     chosen, found = method(name), counts(4, 6)
-    spatial = None
-    if chosen.block != (1, 1):
-        spatial = np.random.default_rng(1).integers(-127, 128, (2, 2, chosen.codes))
-    emulated = emulate(found, chosen, spatial)
-    assert np.array_equal(emulated.codes, by_torch(found, chosen, spatial))
+    with monkeypatch.context() as patch:
+        if chosen.block != (1, 1):
+            spatial = np.random.default_rng(1).integers(-127, 128, (2, 2, chosen.codes))
+            patch.setattr("scene2spad.emulation.emulated_chain.fixed_spatial", lambda _: spatial)
+        emulated = emulate(found, chosen)
+        assert np.array_equal(emulated.codes, by_torch(found, chosen))
     assert emulated.counters.photons == found.sum()
     assert emulated.bits == emulated.codes.size * (8 if chosen.family == "coarse" else 16)
     sensor = sensor_by_name("reference")
