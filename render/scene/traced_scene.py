@@ -31,6 +31,8 @@ FACE_ALBEDO = "face_albedo"
 # u of albedo 0 on a plastic's ramp, and how much more albedo 1 has; the ramp's mean, 1/2 whatever the albedo, only says
 # how often paths follow the coat
 RAMP_FROM, RAMP = 0.25, 0.5
+# not by the texture units of a GPU, which round places between texels to 1/256
+BITMAP = {"type": "bitmap", "raw": True, "filter_type": "bilinear", "accel": False}
 
 
 class TracedScene:
@@ -337,19 +339,14 @@ def _albedo(material: Material) -> dict[str, object] | None:
     if _is_on_ramp(material):
         # two texels, whose centres are at a quarter and at three quarters
         ramp = mi.Bitmap(np.array([[[0], [1]]], np.float32))
-        return {"type": "bitmap", "bitmap": ramp, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+        return {**BITMAP, "bitmap": ramp, "wrap_mode": "clamp"}
     return _texture(material.albedo)
 
 
 def _texture(value: float | Texture) -> dict[str, object]:
     if not isinstance(value, Texture):
         return {"type": "uniform", "value": float(value)}
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(np.array(value.image[..., None])),
-        "raw": True,
-        "filter_type": "bilinear",
-    }
+    return {**BITMAP, "bitmap": mi.Bitmap(np.array(value.image[..., None]))}
 
 
 def _bsdf(material: Material, albedo: dict[str, object] | None) -> dict[str, object]:
