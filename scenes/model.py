@@ -38,7 +38,7 @@ MATERIAL_KINDS: tuple[str, ...] = get_args(MaterialKind)
 LASER_MODES: tuple[str, ...] = get_args(LaserMode)
 DISTRIBUTIONS: tuple[str, ...] = get_args(MicrofacetDistribution)
 # Fields that came later, left out of a hash at these values: what was there before keeps its hash.
-_ADDED_AT = {"distribution": "ggx"}
+_ADDED_AT = {"distribution": "ggx", "clamps": False}
 # Metres from the origin: float32, in which rays are traced, resolves 1 m there.
 MAX_COORDINATE_M = 1e7
 MAX_IMAGE_SIDE = 16384  # pixels
@@ -47,16 +47,18 @@ MIN_CONE_DEG = 1e-6  # float32 holds its intensity, and places on its rim
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A single-channel linear image mapped by texture coordinates: u to the right, v upwards, both repeating.
+    """A single-channel linear image mapped by texture coordinates: u to the right, v upwards.
 
-    image: (h, w) float32, row 0 on top. `name` says where it came from. Raises InputError for values below 0.
+    image: (h, w) float32, row 0 on top. `name` says where it came from. Outside [0, 1] the image repeats, or its border
+    goes on if it `clamps`. Raises InputError for values below 0.
     """
 
     image: np.ndarray
     name: str
+    clamps: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        require_kinds(self, "texture", name=str)
+        require_kinds(self, "texture", name=str, clamps=bool)
         image = number_array(self.image, np.float32, f"texture {self.name}")
         require(image.ndim == 2 and image.size > 0, f"texture {self.name}: shape {image.shape}, expected (h, w)")
         require(bool(np.isfinite(image).all()), f"texture {self.name}: holds NaN or infinite values")

@@ -346,7 +346,8 @@ def _albedo(material: Material) -> dict[str, object] | None:
 def _texture(value: float | Texture) -> dict[str, object]:
     if not isinstance(value, Texture):
         return {"type": "uniform", "value": float(value)}
-    return {**BITMAP, "bitmap": mi.Bitmap(np.array(value.image[..., None]))}
+    wrap = "clamp" if value.clamps else "repeat"
+    return {**BITMAP, "bitmap": mi.Bitmap(np.array(value.image[..., None])), "wrap_mode": wrap}
 
 
 def _bsdf(material: Material, albedo: dict[str, object] | None) -> dict[str, object]:

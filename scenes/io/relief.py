@@ -96,7 +96,8 @@ def relief(
     vertices = np.concatenate((grid, flaps))
     faces = np.concatenate((faces, flap_faces + len(grid)))
     normals = None if cosine else -vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    material = Material(albedo=albedo, name=albedo.name)
+    # half of a border pixel lies outside its texel's centre, where a repeating image shows its other border
+    material = Material(albedo=replace(albedo, clamps=True), name=albedo.name)
     mesh = Surface(vertices, faces, material, uv=np.concatenate((uv, flap_uv)), normals=normals, name="relief")
     fov = math.degrees(2 * math.atan(columns / 2 / focal_px))
     camera = Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=fov, width=columns, height=rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,7 +67,7 @@ def with_sharp_texels(texture: Texture) -> Texture:
     factor = SHARP_PIXELS // max(texture.image.shape)
     if factor < 2:
         return texture
-    return Texture(np.kron(texture.image, np.ones((factor, factor), np.float32)), texture.name)
+    return replace(texture, image=np.kron(texture.image, np.ones((factor, factor), np.float32)))
 
 
 def _image_pixels(path: Path, linear: bool, channel: str, tint: Colour) -> np.ndarray:

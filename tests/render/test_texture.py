@@ -39,7 +39,7 @@ def view(*surfaces: Surface) -> Scene:
 
 
 def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Look a texture up as `Texture` says: u to the right, v upwards, both repeating; texels' centres at halves."""
+    """Look a repeating texture up as `Texture` says: u to the right, v upwards; texels' centres at halves."""
     height, width = image.shape
     x, y = u * width - 0.5, (1 - v) * height - 0.5
     column, row = np.floor(x).astype(int), np.floor(y).astype(int)

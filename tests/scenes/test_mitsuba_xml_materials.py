@@ -191,16 +191,26 @@ def test_the_nearest_texel_is_mitsubas(tmp_path: Path, mitsuba: object) -> None:
     assert len(notes) == 1 and "nearest is taken as bilinear" in notes[0]
 
 
+def test_a_texture_that_clamps_does_so(tmp_path: Path) -> None:
+    """One file, that repeats on one shape and clamps on the other."""
+    image(tmp_path, "t.png", [[0, 255]])
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="t.png"/>{}</texture>'
+    shape = f'<shape type="rectangle"><bsdf type="diffuse">{texture}</bsdf></shape>'
+    clamp = '<string name="wrap_mode" value="clamp"/>'
+    scene = load(tmp_path, shape.format(clamp) + shape.format(""))
+    assert [surface.material.albedo.clamps for surface in scene.surfaces] == [True, False] and scene.notes == ()
+
+
 def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
     image(tmp_path, "t.png", np.full((2, 2), 255))
     texture = '<texture type="bitmap" name="{}"><string name="filename" value="t.png"/>{}</texture>'
-    clamp = '<string name="wrap_mode" value="clamp"/>'
+    mirror = '<string name="wrap_mode" value="mirror"/>'
     bsdfs = [
         '<bsdf type="diffuse" id="white"><rgb name="reflectance" value="1.5"/></bsdf>',
-        f'<bsdf type="bumpmap" id="bumpy">{texture.format("", clamp)}<bsdf type="diffuse"/></bsdf>',
+        f'<bsdf type="bumpmap" id="bumpy">{texture.format("", mirror)}<bsdf type="diffuse"/></bsdf>',
         '<bsdf type="roughplastic" id="old"><string name="distribution" value="phong"/>'
         '<boolean name="nonlinear" value="true"/></bsdf>',
-        f'<bsdf type="plastic" id="mean">{texture.format("specular_reflectance", clamp)}</bsdf>',
+        f'<bsdf type="plastic" id="mean">{texture.format("specular_reflectance", mirror)}</bsdf>',
         '<bsdf type="twosided" id="two"><bsdf type="diffuse"/><bsdf type="plastic"/></bsdf>',
         '<bsdf type="diffuse" id="typo"><rgb name="reflectence" value="0.1"/></bsdf>',
         '<bsdf type="dielectric" id="tint"><rgb name="specular_transmittance" value="0.5"/></bsdf>',

@@ -67,6 +67,18 @@ def test_a_steep_slope_is_not_cut():
     assert axial == pytest.approx(depth, rel=1e-3)
 
 
+def test_border_pixels_have_their_own_colour_alone():
+    """Bright on the left and black on the right: a texture that repeats lends each border an eighth of the other."""
+    from render.engine import render
+    from render.settings import RenderSettings
+
+    halves = Texture(np.tile(np.where(np.arange(20) < 10, 0.8, 0.0), (15, 1)), "halves")
+    transient = render(relief("halves", np.full((15, 20), 2.0), halves, 20.0), RenderSettings(bounces=1, grid=4))
+    seen = (transient.total_radiance() * transient.depth_m.astype(float) ** 2)[[0, 7, -1]]
+    assert seen[:, :8] == pytest.approx(np.full((3, 8), seen[1, 3]), rel=1e-3)
+    assert np.abs(seen[:, -8:]).max() == 0
+
+
 def test_the_cosine_is_a_switch():
     from render.engine import render
     from render.settings import RenderSettings

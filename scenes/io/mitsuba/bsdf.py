@@ -201,7 +201,7 @@ def _nonlinear(plugin: Plugin, values: Values) -> Values:
 def _changed(albedo: float | Texture, change: Callable[[np.ndarray], np.ndarray]) -> float | Texture:
     """Return an albedo, or a texture's every one, after a change, from 0 to 1."""
     if isinstance(albedo, Texture):
-        return Texture(np.clip(change(albedo.image), 0, 1), albedo.name)
+        return replace(albedo, image=np.clip(change(albedo.image), 0, 1))
     return float(np.clip(change(np.array(albedo)), 0, 1))
 
 

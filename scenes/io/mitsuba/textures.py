@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ class Textures:
     def __init__(self, document: Document, *, reads_images: bool = True) -> None:
         self._document = document
         self._reads_images = reads_images
-        self._images: dict[tuple[Path, bool, str], Texture] = {}
+        self._images: dict[tuple[Path, bool, str, bool], Texture] = {}
         self._sharp: dict[int, Texture] = {}  # by the id of the image that is enlarged
 
     def fraction(self, plugin: Plugin, name: str, default: float, uv: Uv) -> float | Texture:
@@ -49,7 +50,7 @@ class Textures:
         uv.agree(plugin, matrix)
         if texture.image.max() > 1:
             plugin.note(f"{name} over 1 is clipped to 1")
-            texture = Texture(np.minimum(texture.image, 1), texture.name)
+            texture = replace(texture, image=np.minimum(texture.image, 1))
         return texture
 
     def mean(self, plugin: Plugin, name: str, default: float) -> float:
@@ -77,7 +78,7 @@ class Textures:
     def _bitmap(self, plugin: Plugin) -> Texture:
         plugin.ignore(("max_anisotropy", "cache", "format"))
         wrap = plugin.string("wrap_mode", "repeat")
-        if wrap != "repeat":
+        if wrap not in ("repeat", "clamp"):
             plugin.note(f"wrap_mode {wrap} is taken as repeat")
         chosen, channel = plugin.string("channel", "all"), "luminance"
         if chosen == "a":  # of version 0.6; else Mitsuba leaves alpha out, of opacities too
@@ -86,7 +87,7 @@ class Textures:
             plugin.note(f"channel {chosen} of the image is taken as its luminance")
         linear = plugin.boolean("raw", False) or plugin.number("gamma", 0.0) == 1
         path = self._document.file(plugin.element, plugin.string("filename"), "texture")
-        read = self.image(path, linear, channel)
+        read = self.image(path, linear, channel, clamps=wrap == "clamp")
         if plugin.string("filter_type", "bilinear") == "nearest" and self._reads_images:
             return self._with_sharp_texels(plugin, read)
         return read
@@ -99,12 +100,12 @@ class Textures:
             plugin.note("filter_type nearest is taken as bilinear, as the image is large")
         return self._sharp[id(read)]
 
-    def image(self, path: Path, linear: bool, channel: str) -> Texture:
+    def image(self, path: Path, linear: bool, channel: str, *, clamps: bool = False) -> Texture:
         """Return a texture file, read once."""
-        key = (path.resolve(), linear, channel)
+        key = (path.resolve(), linear, channel, clamps)
         if key not in self._images:
             read = load_texture(path, linear=linear, channel=channel) if self._reads_images else _UNREAD
-            self._images[key] = read
+            self._images[key] = replace(read, clamps=clamps)
         return self._images[key]
 
 
