@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from render.backend.drjit_types import Array, Interactions, LobeSamples, Masks, Rays, Vectors
-from render.scene.rays import MAX_LAYERS, shape_index, spawn
+from render.scene.rays import MAX_LAYERS, ray_to, shape_index, spawn
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi
 
 MIRRORS = {"conductor", "plastic", "dielectric", "thindielectric"}  # materials with a lobe of no width
@@ -44,7 +44,7 @@ def _transmission(ior: Array, ray: Rays, si: Interactions) -> Array:
 def straight_transmission(world: TracedScene, si: Interactions, point: Vectors, active: Masks) -> Array:
     """Compute the transmission of the straight way from a surface to a point; solid glass, which bends light, blocks
     it."""
-    ray = si.spawn_ray_to(point)
+    ray = ray_to(si, point)
     transmission = dr.full(Float, 1, dr.width(ray.d))
     if dr.hint(not world.sees_through, mode="scalar"):
         transmission = dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1))

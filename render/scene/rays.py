@@ -64,6 +64,14 @@ def spawn(si: Interactions, direction: Vectors) -> Array:
     return mi.Ray3f(dr.fma(off, si.n, si.p), direction)
 
 
+def ray_to(si: Interactions, point: Vectors) -> Array:
+    """Return the ray from a surface to a little before a point, as on that a surface may lie."""
+    start = spawn(si, point - si.p).o
+    way = point - start
+    length = dr.norm(way)
+    return mi.Ray3f(start, way / length, length * (1 - mi.math.ShadowEpsilon), 0, mi.Color0f())
+
+
 def sample_bsdf(si: Interactions, random: Generators, active: Masks) -> tuple[Array, Array]:
     """Sample a direction of a surface's lobes, and its weight: reflectance times cosine over density."""
     first, second = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())

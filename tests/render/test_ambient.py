@@ -15,7 +15,7 @@ from render.scene.traced_scene import TracedScene, mi
 from render.settings import RenderSettings
 from scene2spad.bench.hard import oracles
 from scenes.geometry.shapes import box, sphere
-from scenes.model import Ambient, Material, Scene, Surface
+from scenes.model import Ambient, Camera, Material, Scene, Surface
 
 GLASS = Material("thindielectric", ior=1.5)
 
@@ -55,6 +55,22 @@ def test_light_through_panes_is_what_mitsuba_finds_by_chance():
     theirs = np.array([mitsuba(world, 1024, 30, seed) for seed in range(8)])
     error = np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 8)
     assert abs(ours.mean() - theirs.mean()) < 4 * error and error < 0.03 * ours.mean()
+
+
+@pytest.mark.parametrize("pane", [False, True], ids=["all opaque", "beside glass"])
+def test_ambient_light_is_the_same_at_every_scale(pane):
+    """The sky comes in at the rim of a narrow gap alone, 0.05 mm high or 50 mm."""
+
+    def gap(metres: float) -> np.ndarray:
+        rows = [[(-1, y, -1), (1, y, -1), (1, y, 1), (-1, y, 1)] for y in (-0.05, 0.05)]
+        faces = [oracles.quad(np.array(row) * metres, Material(albedo=0.3)) for row in rows]
+        glass = oracles.quad(np.array([(2, 2, 2), (3, 2, 2), (3, 3, 2), (2, 3, 2)]) * metres, GLASS)
+        camera = Camera.look_at((0, 0, 0), (0, -1, -2), fov_deg=30, width=6, height=4)
+        scene = Scene("gap", (*faces, glass) if pane else tuple(faces), camera, ambient=Ambient(radiance=1))
+        return ambient_light(TracedScene(scene), 256, 30, 1).radiance
+
+    small, large = gap(0.5e-3), gap(0.5)
+    assert small.mean() == pytest.approx(large.mean(), rel=0.02) and large.max() < 0.2
 
 
 def test_the_stated_noise_is_that_of_repetitions():
