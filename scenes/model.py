@@ -34,6 +34,7 @@ MaterialKind = Literal[
 ]
 MicrofacetDistribution = Literal["ggx", "beckmann"]
 LaserMode = Literal["flood", "line", "scan"]
+Triple = Iterable[float]  # x, y, z
 MATERIAL_KINDS: tuple[str, ...] = get_args(MaterialKind)
 LASER_MODES: tuple[str, ...] = get_args(LaserMode)
 DISTRIBUTIONS: tuple[str, ...] = get_args(MicrofacetDistribution)
@@ -88,7 +89,7 @@ class Material:
     specular    scale of the specular reflectance (plastic, conductor)
     ior         interior index of refraction (plastic, dielectric)
     eta, k      complex index of a conductor; (0, 1) is a perfect mirror. Metals by name have theirs at 650 nm
-    opacity     share of the surface that is there (cut-out masks), number or texture
+    opacity     share of the surface that is there (cut-out masks), number or texture; 1 of glass
     """
 
     kind: MaterialKind = "diffuse"
@@ -113,6 +114,9 @@ class Material:
             object.__setattr__(self, label, finite_number(getattr(self, label), f"{where}: {label}"))
         require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
         require(1 < self.ior <= 5, f"{where}: index of refraction {self.ior:g} is outside (1, 5]")
+        require(
+            not (self.is_glass and self.has_holes), f"{where}: glass has an opacity of 1 here, cut its mesh instead"
+        )
         for label in ("eta", "k"):
             require(getattr(self, label) >= 0, f"{where}: conductor {label} {getattr(self, label):g} is negative")
 
@@ -124,8 +128,12 @@ class Material:
     @property
     def lets_light_through(self) -> bool:
         """Return whether light goes through the surface, or through holes cut in it."""
-        opaque = self.opacity.image.min() >= 1 if isinstance(self.opacity, Texture) else self.opacity >= 1
-        return self.is_glass or not opaque
+        return self.is_glass or self.has_holes
+
+    @property
+    def has_holes(self) -> bool:
+        """Return whether the opacity is below 1 anywhere."""
+        return bool(np.min(self.opacity.image if isinstance(self.opacity, Texture) else self.opacity) < 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,14 +189,7 @@ class Camera:
 
     @classmethod
     def look_at(
-        cls,
-        origin: Iterable[float],
-        target: Iterable[float],
-        *,
-        fov_deg: float,
-        width: int,
-        height: int,
-        up: Iterable[float] = (0.0, 1.0, 0.0),
+        cls, origin: Triple, target: Triple, *, fov_deg: float, width: int, height: int, up: Triple = (0.0, 1.0, 0.0)
     ) -> Camera:
         """Return a camera at `origin` [m] that looks at `target` [m], `up` upwards in the image, or an InputError."""
         return cls(looking_pose(origin, target, up), fov_deg, width, height)

@@ -65,7 +65,7 @@ class TracedScene:
         self.groups = tuple(tuple(group) for group in groups.values())
         materials = [group[0].material for group in self.groups]
         self.has_glass = any(m.is_glass for m in materials)
-        self.has_cutouts = any(_has_cutouts(m) for m in materials)
+        self.has_cutouts = any(m.has_holes for m in materials)
         masks = "mitsuba" if cutouts_by_mitsuba else "ours" if self.has_cutouts else "none"
         self.origin = np.mean(scene.bounds(), axis=0) if origin_in_scene else scene.camera.origin
         self.plastics: dict[tuple, Any] = {}
@@ -134,9 +134,9 @@ class TracedScene:
         """Make Mitsuba's BSDF of a material, taken from those known if it is a plain, whole plastic that is among
         them."""
         bsdf = _bsdf(material, _albedo(material))
-        if masks == "mitsuba" and _has_cutouts(material):
+        if masks == "mitsuba" and material.has_holes:
             bsdf = {"type": "mask", "opacity": _texture(material.opacity), "nested": bsdf}
-        if _has_cutouts(material) or not _is_on_ramp(material):
+        if material.has_holes or not _is_on_ramp(material):
             return mi.load_dict(bsdf)
         key = material.kind, *(getattr(material, name) for name in _PARAMETERS[material.kind])
         self.plastics[key] = self.plastics.get(key) or known.get(key) or mi.load_dict(bsdf)
@@ -252,10 +252,6 @@ def _merge_key(surface: Surface) -> tuple:
         opacity, albedo = id(opacity), albedo or material.albedo
     parameters = tuple(getattr(material, name) for name in _PARAMETERS[kind])
     return kind, parameters, albedo, opacity, surface.emission, surface.normals is not None
-
-
-def _has_cutouts(material: Material) -> bool:
-    return material.lets_light_through and not material.is_glass
 
 
 def _specular_albedo(material: Material) -> float:

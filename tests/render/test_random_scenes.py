@@ -19,11 +19,12 @@ SEEDS = [*range(8), *(pytest.param(seed, marks=pytest.mark.slow) for seed in ran
 
 
 def random_surface(rng: np.random.Generator, scale: float, texture: Texture) -> Surface:
+    kind = str(rng.choice(MATERIAL_KINDS))
     material = Material(
-        str(rng.choice(MATERIAL_KINDS)),
+        kind,
         albedo=texture if rng.random() < 0.3 else rng.choice([0, 0.001, 0.5, 0.99, 1]),
         roughness=10 ** rng.uniform(-2.5, 0),
-        opacity=texture if rng.random() < 0.2 else rng.choice([1, 1, 1, 0.3, 0]),
+        opacity=1 if kind.endswith("dielectric") else texture if rng.random() < 0.2 else rng.choice([1, 1, 1, 0.3, 0]),
         eta=rng.choice([0, 1.5]),
         k=rng.choice([1, 6]),
     )

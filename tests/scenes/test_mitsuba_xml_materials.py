@@ -63,8 +63,8 @@ def test_colours_become_one_number(tmp_path: Path, value: str, expected: float) 
             {"kind": "thindielectric", "ior": 2.419 / 1.333},
         ),
         (
-            '<bsdf type="mask"><float name="opacity" value="0.3"/><bsdf type="dielectric"/></bsdf>',
-            {"kind": "dielectric", "opacity": 0.3},
+            '<bsdf type="mask"><float name="opacity" value="1"/><bsdf type="dielectric"/></bsdf>',
+            {"kind": "dielectric", "opacity": 1},
         ),
     ],
 )
@@ -235,6 +235,7 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
     [
         ('<bsdf type="principled"><float name="spec_trans" value="1"/></bsdf>', "spec_trans 1"),
         ('<bsdf type="blendbsdf"/>', "'blendbsdf'"),
+        ('<bsdf type="mask"><bsdf type="dielectric"/></bsdf>', "glass has an opacity of 1 here"),
         ('<bsdf type="roughdielectric"/>', "'roughdielectric'"),
         ('<bsdf type="twosided"/>', "0 bsdfs"),
         (16 * '<bsdf type="twosided">' + '<bsdf type="diffuse"/>' + 16 * "</bsdf>", "nested more than"),

@@ -68,6 +68,8 @@ def test_texture_refuses(image, words):
         ({"specular": 2.0}, "specular"),
         ({"opacity": -1.0}, "opacity"),
         ({"opacity": texture(3.0)}, "opacity"),
+        ({"kind": "dielectric", "opacity": 0.9}, "glass has an opacity of 1 here, cut its mesh instead"),
+        ({"kind": "thindielectric", "opacity": texture()}, "glass has an opacity of 1"),
         ({"roughness": 0.0}, "roughness"),
         ({"distribution": "hills"}, "distribution 'hills' is unknown, expected one of ggx, beckmann"),
         ({"roughness": 1.5}, "roughness"),
