@@ -112,7 +112,6 @@ class RenderSettings:
             ("direct_fraction", 0.05, 0.95),
             ("edge_threshold", 0, 1),
             ("ambient_spp", 1, 1 << 16),
-            ("indirect_growth", 0, 1),
             ("indirect_tolerance_m", 1e-4, 10),
         )
         for name, low, high in limits:
@@ -143,9 +142,11 @@ class RenderSettings:
                 )
         if self.budget is not None and self.error is not None:
             raise InputError("render: give an error target or a photon budget, not both")
-        tolerance, where = self.direct_tolerance_m, "render: direct_tolerance_m"
-        if tolerance is not None and require_number(tolerance, where) != 0 and not 1e-4 <= tolerance <= 10:
-            raise InputError(f"{where} {tolerance:g} is neither 0 nor 1e-4 to 10")
+        # cells of a smaller growth than that float32 cannot tell apart
+        for name, high in (("direct_tolerance_m", 10), ("indirect_growth", 1)):
+            value = getattr(self, name)
+            if value is not None and value != 0 and not 1e-4 <= value <= high:
+                raise InputError(f"render: {name} {value:g} is neither 0 nor 1e-4 to {high}")
 
 
 @dataclass(frozen=True)

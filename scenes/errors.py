@@ -95,14 +95,17 @@ def require_whole(value: object, what: str) -> int:
 def normalise_fields(owner: DataclassInstance, where: str) -> None:
     """Make fields of a frozen dataclass that are annotated as int, float, bool or str Python's own, as JSON holds them.
 
+    A number that may be left out, as in `int | None`, stays None where it is.
     Raises InputError that names the first field of another kind, its value, and what is expected; `where` comes first.
     Its module must postpone annotations, which then are the words that the source has.
     """
     for item in fields(owner):
         value, what = getattr(owner, item.name), f"{where}: {item.name}"
-        if item.type == "int":
+        if value is None and str(item.type) in ("int | None", "float | None"):
+            continue
+        if item.type in ("int", "int | None"):
             object.__setattr__(owner, item.name, require_whole(value, what))
-        elif item.type == "float":
+        elif item.type in ("float", "float | None"):
             object.__setattr__(owner, item.name, require_number(value, what))
         elif item.type == "bool":
             require(isinstance(value, bool), f"{what} {value!r}, expected True or False")

@@ -48,10 +48,9 @@ MIN_CONE_DEG = 1e-6  # float32 holds its intensity, and places on its rim
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A single-channel linear image mapped by texture coordinates: u to the right, v upwards.
+    """A single-channel linear image mapped by texture coordinates: u to the right, v upwards, repeating or clamped.
 
-    image: (h, w) float32, row 0 on top. `name` says where it came from. Outside [0, 1] the image repeats, or its border
-    goes on if it `clamps`. Raises InputError for values below 0.
+    image: (h, w) float32, row 0 on top. `name` says where it came from. Raises InputError for values below 0.
     """
 
     image: np.ndarray
@@ -114,9 +113,7 @@ class Material:
             object.__setattr__(self, label, finite_number(getattr(self, label), f"{where}: {label}"))
         require(0 < self.roughness <= 1, f"{where}: roughness {self.roughness:g} is outside (0, 1]")
         require(1 < self.ior <= 5, f"{where}: index of refraction {self.ior:g} is outside (1, 5]")
-        require(
-            not (self.is_glass and self.has_holes), f"{where}: glass has an opacity of 1 here, cut its mesh instead"
-        )
+        require(not (self.is_glass and self.has_holes), f"{where}: glass has opacity 1 here, cut its mesh instead")
         for label in ("eta", "k"):
             require(getattr(self, label) >= 0, f"{where}: conductor {label} {getattr(self, label):g} is negative")
 
@@ -260,8 +257,9 @@ class Laser:
         require_choice(self.mode, LASER_MODES, "laser mode")
         object.__setattr__(self, "baseline_m", three_numbers(self.baseline_m, "laser baseline [m]"))
         if self.cone_deg is not None:
-            good = MIN_CONE_DEG <= finite_number(self.cone_deg, "laser cone") <= 360
-            require(good, f"laser cone {self.cone_deg} degrees is outside (0, 360], {MIN_CONE_DEG:g} at least")
+            object.__setattr__(self, "cone_deg", finite_number(self.cone_deg, "laser cone"))
+            good = MIN_CONE_DEG <= self.cone_deg <= 360
+            require(good, f"laser cone {self.cone_deg:g} degrees is outside (0, 360], {MIN_CONE_DEG:g} at least")
         require(self.cone_deg is None or self.mode == "flood", f"laser mode {self.mode}: a cone is for flood only")
 
     @property

@@ -235,7 +235,7 @@ def test_what_is_changed_or_left_out_is_noted(tmp_path: Path) -> None:
     [
         ('<bsdf type="principled"><float name="spec_trans" value="1"/></bsdf>', "spec_trans 1"),
         ('<bsdf type="blendbsdf"/>', "'blendbsdf'"),
-        ('<bsdf type="mask"><bsdf type="dielectric"/></bsdf>', "glass has an opacity of 1 here"),
+        ('<bsdf type="mask"><bsdf type="dielectric"/></bsdf>', "glass has opacity 1 here"),
         ('<bsdf type="roughdielectric"/>', "'roughdielectric'"),
         ('<bsdf type="twosided"/>', "0 bsdfs"),
         (16 * '<bsdf type="twosided">' + '<bsdf type="diffuse"/>' + 16 * "</bsdf>", "nested more than"),

@@ -8,6 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from render.settings import RenderSettings
 from scenes import Ambient, Camera, InputError, Laser, Material, Scene, Surface, Texture
 from scenes.library.catalog import load_scene
 from scenes.placing import Placing
@@ -93,6 +94,8 @@ def refused(make: Callable[[], object]) -> str:
         (lambda: Placing(scale="a"), "scale [metres a unit] 'a' is not a finite number"),
         (lambda: Placing(origin=3), "camera position 3 is not three finite numbers"),
         (lambda: Placing(target=(0, 0)), "point to look at (0, 0) is not three finite numbers"),
+        (lambda: RenderSettings(indirect_growth=1e-7), "render: indirect_growth 1e-07 is neither 0 nor 1e-4 to 1"),
+        (lambda: RenderSettings(indirect_growth=True), "render: indirect_growth True, expected a number"),
         (lambda: Placing(fov_deg="a"), "camera fov 'a' is not a finite number"),
         (lambda: Placing(bare="no"), "placing: bare 'no', expected True or False"),
     ],
@@ -120,6 +123,14 @@ def test_indices_that_are_no_whole_numbers_are_refused(faces: object, message: s
 @pytest.mark.parametrize("faces", [[[0.0, 1.0, 2.0]], np.array([[0, 1, 2]], np.uint8), [(0, 1, 2)]])
 def test_whole_indices_of_any_type_are_taken(faces: object) -> None:
     assert mesh(faces=faces).faces.tolist() == [[0, 1, 2]]
+
+
+def test_numbers_of_numpy_become_pythons_own() -> None:
+    """Files state them in JSON, and a scene's hash does not tell how its numbers were given."""
+    settings = RenderSettings(error=np.float32(0.05), clamp=np.float64(10), bounces=np.int64(2))
+    assert type(settings.error) is type(settings.clamp) is float and type(settings.bounces) is int
+    cones = [Laser(cone_deg=cone).cone_deg for cone in (30, 30.0, np.float32(30))]
+    assert {type(cone) for cone in cones} == {float} and set(cones) == {30.0}
 
 
 def test_surfaces_and_notes_come_from_any_iterable() -> None:
