@@ -15,6 +15,7 @@ from render.indirect.camera_paths import energy_by_bounces
 from render.indirect.integrator import IndirectTask, indirect_light, path_grid
 from render.indirect.launch_layout import block_order
 from render.indirect.schedule import uniform
+from render.planning import pilot_pixels
 from render.scene.traced_scene import TracedScene
 from render.settings import MIN_SPP, Plan
 from render.transient.samples import SampleBuffer, Samples
@@ -22,14 +23,15 @@ from render.transient.samples import SampleBuffer, Samples
 # Direct light in fewer of the pixels, and so many times darker than the mean indirect light, sets no scale: sums of
 # fixed point hold samples of up to 2^17 times their scale.
 FEW_LIT, FAINT = 1 / 16, 2.0**10
-PILOT_PIXELS, PILOT_SPP = 256, (16, 256)  # of the pilot; paths a pixel, more where the first ones find nothing
+PILOT_SPP = 16, 256  # paths a pixel of the pilot, more where the first ones find nothing
 BRIGHTEST = 16.0  # radiance of the brightest pixel, in units of the mean: a guess
 
 
 class LightScale(NamedTuple):
     """Units of indirect light.
 
-    origin_m   path length of every flat pixel from which its cells widen: the direct return's
+    origin_m   path length of every flat pixel from which its cells widen: the direct return's, or where there is none
+               that by way of what the pixel sees
     brightest  radiance that sets the fixed-point scale; 0 where no path finds light
     light      samples whose power and radiance error targets and clamps are counted in
     reasons    what is unusual about them, one line each
@@ -45,13 +47,16 @@ def light_scale(world: TracedScene, plan: Plan, direct: Samples, seed: int) -> L
     """Return the units of indirect light: those of direct light, or of a pilot where that is missing."""
     pixels = world.scene.camera.height * world.scene.camera.width
     origin_m, brightest = mean_path(direct, pixels)
-    if (origin_m > 0).mean() >= FEW_LIT:
+    lit = origin_m > 0
+    if not lit.all():
+        origin_m = np.where(lit, origin_m, nearest_path(world))
+    if lit.mean() >= FEW_LIT:
         return LightScale(origin_m, brightest, direct)
     indirect, paths = _mean_indirect(world, plan.bounces, seed)
     if indirect <= FAINT * brightest:
         reason = f"indirect light: none, {paths} paths of a pilot found no light, and no pixel is lit directly"
         return LightScale(origin_m, brightest, direct, () if brightest > 0 else (reason,))
-    origin_m, brightest = np.where(origin_m > 0, origin_m, nearest_path(world)), BRIGHTEST * indirect
+    brightest = BRIGHTEST * indirect
     grid = path_grid(world, origin_m, brightest, plan.bounces, plan.indirect_tolerance_m, plan.indirect_growth)
     blocks, light = block_order(np.arange(pixels), world.scene.camera.width), SampleBuffer()
     schedule = uniform(blocks, MIN_SPP, reuses_paths=False)
@@ -62,17 +67,13 @@ def light_scale(world: TracedScene, plan: Plan, direct: Samples, seed: int) -> L
 
 def _mean_indirect(world: TracedScene, bounces: int, seed: int) -> tuple[float, int]:
     """Estimate the mean indirect radiance of a pixel by the paths of a pilot; return it and their number."""
-    camera = world.scene.camera
-    every = np.arange(camera.height * camera.width)
-    count = min(PILOT_PIXELS, len(every))
-    chosen = np.sort(np.random.default_rng(seed).choice(every, count, replace=False))
-    energy, paths = 0.0, 0
+    chosen, energy, paths = pilot_pixels(world, seed), 0.0, 0
     for number, spp in enumerate(PILOT_SPP):
         energy = float(energy_by_bounces(world, chosen, spp, bounces, seed + number)[0].sum())
-        paths += spp * count
+        paths += spp * len(chosen)
         if energy > 0:
             break
-    return energy / count, paths
+    return energy / len(chosen), paths
 
 
 def mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:

@@ -62,6 +62,22 @@ def test_indirect_light_is_there_where_no_pixel_is_lit_directly(scene):
     assert any("hardly any direct light" in reason for reason in found.meta["plan"]["reasons"])
 
 
+@pytest.mark.parametrize("laser", [Laser(cone_deg=25), Laser(baseline_m=(1.5, 0, 0))], ids=["cone", "shadow"])
+def test_cells_are_as_narrow_where_no_direct_light_falls(laser):
+    """A quarter of the pixels is lit, or most are; light comes first to all of them by way of what they see."""
+    corners = np.array([(0.6, -1.5, 1.5), (0.9, -1.5, 1.5), (0.9, 1.5, 1.5), (0.6, 1.5, 1.5)], float)
+    post = Surface(corners, FACES, WALLS, name="post")
+    scene = Scene("room", (room(), post), looking((0, 0, -1), (0, 0, 1), side=16), laser)
+    found = render(scene, RenderSettings(bounces=3, spp=64), seed=1)
+    pixel, indirect = found.return_pixel, found.bounces > 1
+    lit = np.isin(np.arange(256), pixel[~indirect])
+    assert 16 < lit.sum() < 256 - 16
+    of_pixel, first = np.unique(pixel[indirect], return_index=True)
+    width_m = (found.path_far_m - found.path_near_m)[indirect][first]
+    dark, bright = (np.median(width_m[lit[of_pixel] == side]) for side in (False, True))
+    assert dark < 1.5 * bright
+
+
 @pytest.mark.parametrize("options", [{"filter": True, "adaptive": False}, {"clamp": 10.0}, {"error": 0.3}])
 def test_all_ways_of_indirect_light_work_without_direct_light(options):
     """Clamps and targets are counted in a pilot's light, the filter's regions in the nearest paths."""
