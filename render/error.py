@@ -20,8 +20,8 @@ from scenes.errors import told_apart
 BIN_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PERIOD_S / REFERENCE_BINS
 SIGMA_M = SPEED_OF_LIGHT_M_PER_S * REFERENCE_PULSE_SIGMA_S
 PULSE_POWER = BIN_M / (2 * math.sqrt(math.pi) * SIGMA_M)  # sum over bins of the square of one return of energy 1
-WIDEST_STENCIL = 256
 WIDEST_PIECE, MAX_PIECES = 1.0, 64  # sigma: side by side these are even to 0.3 %
+REACH = math.ceil(5 * math.sqrt(1 + WIDEST_PIECE**2 / 3) * SIGMA_M / BIN_M)  # bins to each side of a piece's centre
 BLOCK_ENTRIES = 1 << 16
 # Pixels that a few rare bright paths can spoil: a thousandth of the image, and at least a block that shares its paths.
 WORST_FRACTION, MIN_WORST = 1e-3, 16
@@ -95,7 +95,7 @@ def _even(samples: Samples, pixels: np.ndarray) -> np.ndarray:
 
 
 def _gaussians(samples: Samples, pixels: np.ndarray) -> np.ndarray:
-    """Return `response` of samples each of which is one Gaussian."""
+    """Return `response` of samples each of which is one Gaussian, no wider than the widest piece."""
     counts = np.zeros(len(pixels) * REFERENCE_BINS)
     row = np.searchsorted(pixels, samples.pixel).astype(np.int32) * REFERENCE_BINS
     # float32: an estimate of errors needs no more, from bins counted from a whole one
@@ -104,22 +104,18 @@ def _gaussians(samples: Samples, pixels: np.ndarray) -> np.ndarray:
     whole = whole.astype(np.int32)
     sigma = (np.sqrt(SIGMA_M**2 + samples.half_width_m**2 / 3) / BIN_M).astype(np.float32)
     height = (samples.radiance / (math.sqrt(2 * math.pi) * sigma)).astype(np.float32)
-    reach = np.minimum(np.ceil(5 * sigma), WIDEST_STENCIL).astype(int)
-    # a few footprints are wide, most are not: one stencil width for each power of two, after the pulse's own
-    narrowest = math.ceil(5 * SIGMA_M / BIN_M)
-    size = narrowest << np.ceil(np.log2(np.maximum(reach / narrowest, 1))).astype(int)
-    for half in np.unique(size):
-        chosen = np.flatnonzero(size == half)
-        stencil = np.arange(-half, half + 1, dtype=np.int32)
-        for part in np.array_split(chosen, 1 + len(chosen) * (2 * half + 1) // BLOCK_ENTRIES):
-            # in place: a pass over blocks that stay in the cache takes half the time
-            weight = np.subtract.outer(within[part], stencil + np.float32(0.5)) / sigma[part, None]
-            np.exp(np.multiply(np.square(weight, out=weight), np.float32(-0.5), out=weight), out=weight)
-            weight *= height[part, None]
-            index = np.add.outer(whole[part], stencil)
-            index &= REFERENCE_BINS - 1  # modulo the period, as there are 1024 of them, at a tenth of the time
-            index += row[part, None]
-            np.add.at(counts, index.ravel(), weight.ravel().astype(np.float64))  # of one type: 40 times as fast
+    stencil = np.arange(-REACH, REACH + 1, dtype=np.int32)
+    block = BLOCK_ENTRIES // len(stencil)
+    for first in range(0, len(row), block):
+        part = slice(first, first + block)
+        # in place: a pass over blocks that stay in the cache takes half the time
+        weight = np.subtract.outer(within[part], stencil + np.float32(0.5)) / sigma[part, None]
+        np.exp(np.multiply(np.square(weight, out=weight), np.float32(-0.5), out=weight), out=weight)
+        weight *= height[part, None]
+        index = np.add.outer(whole[part], stencil)
+        index &= REFERENCE_BINS - 1  # modulo the period, as there are 1024 of them, at a tenth of the time
+        index += row[part, None]
+        np.add.at(counts, index.ravel(), weight.ravel().astype(np.float64))  # of one type: 40 times as fast
     return counts.reshape(len(pixels), REFERENCE_BINS)
 
 
@@ -296,10 +292,12 @@ def power_of(direct: Samples) -> tuple[float, float]:
     A pixel's light is taken as one Gaussian, of the pulse's variance and its own: an underestimate where it is mixed.
     """
     pixels = int(direct.pixel.max(initial=-1)) + 1
-    energy = np.bincount(direct.pixel, weights=direct.radiance, minlength=pixels)
-    first = np.bincount(direct.pixel, weights=direct.radiance * direct.path_m, minlength=pixels)
-    spread = direct.path_m**2 + direct.half_width_m**2 / 3
-    second = np.bincount(direct.pixel, weights=direct.radiance * spread, minlength=pixels)
+    # float64: the variance is the small difference of two large numbers
+    path_m, half_m, radiance = (np.float64(part) for part in (direct.path_m, direct.half_width_m, direct.radiance))
+    energy, first, second = (
+        np.bincount(direct.pixel, weights=radiance * moment, minlength=pixels)
+        for moment in (np.ones(1), path_m, path_m**2 + half_m**2 / 3)
+    )
     lit = energy > 0
     variance = np.maximum(second[lit] / energy[lit] - (first[lit] / energy[lit]) ** 2, 0)
     power = energy[lit] ** 2 * BIN_M / (2 * math.sqrt(math.pi) * np.sqrt(SIGMA_M**2 + variance))

@@ -48,6 +48,7 @@ RATIO = 1.0  # paths that begin in a polished pixel of the laser's image, for ev
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
 SEEN_BY, ELSEWHERE = 2, 1 / 8
 WIDEST_DEG = 60.0  # off the optical axis, which the image of a wider laser does not show as a plane
+MAX_IMAGE = 1 << 25  # pixels of the laser's image: those of a telephoto camera under a wide laser would be without end
 MAX_RATIO = 1e30  # of the densities of both ways
 
 
@@ -57,7 +58,8 @@ class Glossy(NamedTuple):
 
     It looks as the camera does, and begins so much to the `left` of the camera's and `up` that it holds what the laser
     lights. Of a wider laser it is a panorama (`left` and `up` are None): its columns are angles about the vertical axis
-    of the camera, its rows cosines to that, so that all pixels have one solid angle (Archimedes).
+    of the camera, its rows cosines to that, so that all pixels have one solid angle (Archimedes), that of the camera's
+    on the axis or what MAX_IMAGE of them leave to each.
     """
 
     sampling_density: Array
@@ -84,14 +86,15 @@ def has_light_paths(world: TracedScene) -> bool:
 def _look_for(world: TracedScene) -> tuple[Array, ...]:
     """Find the parts of `Glossy`, none if no surface is glossy: a plain tuple, which recordings take for an input."""
     camera, cosine = world.scene.camera, world.scene.laser.cos_half_angle(world.scene.camera)
-    if cosine < math.cos(math.radians(WIDEST_DEG)):
-        width, height = (math.ceil(turns * camera.focal_px) for turns in (2 * math.pi, 2))
+    reach = camera.focal_px * math.tan(min(math.acos(cosine), math.radians(WIDEST_DEG)))
+    left, up = (max(0, math.ceil(reach - side / 2)) for side in (camera.width, camera.height))
+    width, height = camera.width + 2 * left, camera.height + 2 * up
+    if cosine < math.cos(math.radians(WIDEST_DEG)) or width * height > MAX_IMAGE:
+        focal_px = min(camera.focal_px, math.sqrt(MAX_IMAGE / (4 * math.pi)))
+        width, height = (math.ceil(turns * focal_px) for turns in (2 * math.pi, 2))
         image = [dr.opaque(UInt32, number) for number in (width, height)]
         own = _forward_cosines(width, height) >= cosine
     else:
-        reach = camera.focal_px * math.tan(math.acos(cosine))
-        left, up = (max(0, math.ceil(reach - side / 2)) for side in (camera.width, camera.height))
-        width, height = camera.width + 2 * left, camera.height + 2 * up
         image = [dr.opaque(UInt32, number) for number in (width, height, left, up)]
         own = np.zeros((height, width), bool)
         own[up : up + camera.height, left : left + camera.width] = True

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from render.engine import remedy_reasons, render
-from render.error import PULSE_POWER, IndirectErrors, checked_pixels, estimate, response, target_verdict
+from render.error import PULSE_POWER, IndirectErrors, checked_pixels, estimate, power_of, response, target_verdict
 from render.indirect.schedule import Schedule
 from render.planning import PILOT_PIXELS, cell_narrowing
 from render.settings import WIDEST_GROWTH, WIDEST_INDIRECT_M, RenderSettings
@@ -71,6 +71,15 @@ def test_the_brightest_pixels_stand_for_themselves_where_they_hold_much():
     assert np.mean(radiance[pilot] ** 2) > 5 * np.mean(radiance**2)  # the pilot met three of five
     few = checked_pixels(np.arange(9), np.arange(9.0))
     assert np.array_equal(few.pixel, np.arange(9)) and np.all(few.weight == 1)
+
+
+def test_the_power_of_light_is_the_same_at_any_distance():
+    """Two returns 0.1 m apart in a pixel, at 4 m and at a kilometre, in float32 as samples are."""
+    near, far = (
+        power_of(Samples(np.zeros(2, int), *(np.array(column, np.float32) for column in (path, [0.05] * 2, [1, 3])), 1))
+        for path in ([4.0, 4.125], [1024.0, 1024.125])
+    )
+    assert far == pytest.approx(near, rel=1e-6)
 
 
 def test_pixels_count_as_often_as_they_stand_for_others():

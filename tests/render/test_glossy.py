@@ -201,6 +201,16 @@ def test_polished_things_behind_the_camera(cone_deg, mis_weight_sampled):
     assert both.std(axis=0, ddof=1).sum() < alone.std(axis=0, ddof=1).sum()
 
 
+@pytest.mark.parametrize("laser", ["lamp", "aside"])
+def test_an_image_of_few_pixels_gives_the_same_light(laser, mis_weight_sampled, monkeypatch):
+    """A telephoto camera has many times more pixels in what a wide laser lights; here are 9, or 3, in each of these."""
+    monkeypatch.setattr(render.indirect.glossy, "MAX_IMAGE", 400)
+    scene = room(METAL, LASERS[laser])
+    glossy = glossy_of(TracedScene(scene))
+    assert glossy is not None and int(glossy.width[0]) * int(glossy.height[0]) < 500
+    check_both_ways(scene, mis_weight_sampled, 0.1)
+
+
 def test_pixels_of_a_panorama_have_one_solid_angle_and_are_found_again():
     """Their solid angles are those of all directions; what a ray meets lies in the pixel that it began in."""
     world = TracedScene(room(METAL, LASERS["lamp"]))
