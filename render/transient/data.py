@@ -40,7 +40,7 @@ class Transient:
     path_near_m, path_far_m  (N,) float32: a return is uniform over this interval of optical path length, laser to
                   surface to camera; sorted by `path_near_m` within a pixel
     radiance      (N,) float32: radiance integrated over time, per joule emitted, pixel mean [1/(m^2 sr)]
-    bounces       (N,) uint8: surfaces met (1 = direct; of merged indirect light the fewest)
+    bounces       (N,) uint8: surfaces met (1 = direct; 2 of all indirect light but that of mirrors)
     depth_m       (H, W) float32: radial distance to the first opaque surface at the pixel centre, NaN for none
     normal        (H, W, 3) float16, world, toward the camera; albedo (H, W) float16 at the pixel centre
     ambient       (H, W) float32: steady spectral radiance [W/(m^2 sr nm)]
@@ -117,9 +117,9 @@ class Transient:
         good &= self.path_far_m >= self.path_near_m
         if not good.all():
             raise InputError(f"transient: {(~good).sum()} of {good.size} returns are negative, not finite or reversed")
-        for name in ("ambient", "error"):
+        for name in ("depth_m", "ambient", "error"):
             layer = getattr(self, name)
-            good = np.isfinite(layer) & (layer >= 0)
+            good = np.isfinite(layer) & (layer >= 0) | (np.isnan(layer) & (name == "depth_m"))
             if not good.all():
                 row, column = np.argwhere(~good)[0]
                 count, value = (~good).sum(), layer[row, column]
@@ -178,13 +178,14 @@ class Transient:
     def delayed(self, offset_m: float) -> Transient:
         """Return the same scene `offset_m` farther in time alone (a `time` offset): paths + 2 offset, depth + offset.
 
-        offset_m: metres; a negative one brings it nearer, at most until the nearest return begins at the laser. Raises
-        InputError for other offsets, for what is no number, and with a displaced laser, for which a delay is no
-        distance.
+        offset_m: metres; a negative one brings it nearer, at most until the nearest return or surface is at the
+        laser. Raises InputError for other offsets, for what is no number, and with a displaced laser, for which a
+        delay is no distance.
         """
         offset_m = require_number(offset_m, "time offset")
         check_delay(self.meta.get("laser", {}).get("baseline_m", ()))
-        least = -float(self.path_near_m.min(initial=2 * LIMIT_M)) / 2
+        depth_m = np.fmin.reduce(self.depth_m, axis=None, initial=LIMIT_M)
+        least = -min(float(self.path_near_m.min(initial=2 * LIMIT_M)) / 2, float(depth_m))
         require(least <= offset_m <= LIMIT_M, f"time offset {offset_m:g} m is outside {least:g} to {LIMIT_M:g}")
         return replace(
             self,

@@ -225,12 +225,18 @@ def test_a_delay_that_cannot_be_is_named(offset):
     transient = make()
     with pytest.raises(InputError, match=rf"^time offset {re.escape(f'{offset:g}')} m is outside -[\d.]+ to 10000$"):
         transient.delayed(offset)
-    nearest = float(transient.path_near_m.min())
-    assert transient.delayed(-nearest / 2).path_near_m.min() == 0
+    nearest = np.float32(min(transient.path_near_m.min() / 2, np.nanmin(transient.depth_m)))
+    nearer = transient.delayed(-float(nearest))
+    assert min(nearer.path_near_m.min(), np.nanmin(nearer.depth_m)) == 0
+    behind = replace(transient, depth_m=np.full_like(transient.depth_m, 0.25))
+    with pytest.raises(InputError, match=r"outside -0\.25 to"):
+        behind.delayed(-0.5)
 
 
-@pytest.mark.parametrize("layer", ["ambient", "error"])
-@pytest.mark.parametrize("bad", [np.nan, -0.5, np.inf])
+BAD = [(layer, bad) for layer in ("ambient", "error", "depth_m") for bad in (np.nan, -0.5, np.inf)]
+
+
+@pytest.mark.parametrize(("layer", "bad"), BAD[:-3] + BAD[-2:])  # no depth is NaN
 def test_one_bad_pixel_of_a_layer_is_refused(layer, bad):
     good = make(300, 6, 8)
     values = getattr(good, layer).copy()
