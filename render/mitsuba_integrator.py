@@ -15,7 +15,7 @@ from render.backend.llvm import start_mitsuba
 from render.settings import RenderSettings
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, require
+from scenes.errors import InputError, listed, require
 from scenes.io.textures import luminance
 from scenes.limits import require_memory
 from scenes.model import Camera, Material, Scene, Surface
@@ -25,7 +25,7 @@ TEMPORAL_BINS = 1024
 BIN_WIDTH_OPL_M = SPEED_OF_LIGHT_M_PER_S * 100e-9 / TEMPORAL_BINS  # of the reference sensor: 100 ns in 1,024 bins
 VARIANTS = ("_mono", "_rgb")
 _registered: set[str] = set()  # names, which may be registered again for another variant
-CHUNK = 1 << 20  # returns binned at once
+ENTRIES = 1 << 22  # returns, each as often as it has bins, that are binned at once
 
 
 def register_integrator(name: str = NAME) -> None:
@@ -125,10 +125,16 @@ def _rendered(scene: Scene, settings: RenderSettings, seed: int, variant: str) -
 def scene_from_mitsuba(scene: Array, sensor: Array) -> Scene:
     """Read a loaded Mitsuba scene: meshes, uniform diffuse or conducting materials, a perspective camera.
 
-    Raises InputError in one line that names what has no counterpart here.
+    Materials whose back is black in Mitsuba reflect from both sides, with a line in its log. Raises InputError in one
+    line that names what has no counterpart here.
     """
+    import mitsuba as mi
+
     surfaces = tuple(_surface(shape) for shape in scene.shapes())
     require(len(surfaces) > 0, "the scene holds no shapes")
+    one_sided = [shape.id() for shape in scene.shapes() if shape.bsdf().class_name() != "TwoSidedBRDF"]
+    if one_sided:
+        mi.Log(mi.LogLevel.Warn, f"{NAME}: shapes without twosided reflect from both sides here: {listed(one_sided)}")
     return Scene("mitsuba", surfaces, _camera(sensor))
 
 
@@ -192,12 +198,21 @@ def dense_path_histogram(transient: Transient, bins: int, width_m: float, start_
     require_memory(12 * pixels * bins, f"a dense transient of {pixels} pixels and {bins} bins")
     data = np.zeros(pixels * bins)
     pixel = transient.return_pixel
-    for at in range(0, transient.returns, CHUNK):
-        part = slice(at, at + CHUNK)
-        near = (transient.path_near_m[part].astype(np.float64) - start_m) / width_m
-        far = (transient.path_far_m[part].astype(np.float64) - start_m) / width_m
-        first = np.floor(np.clip(near, -1, bins)).astype(np.int64)
-        count = np.floor(np.clip(far, -1, bins)).astype(np.int64) - first + 1
+    near_bin, far_bin = (
+        np.floor(np.clip((path_m - start_m) / width_m, -1, bins)).astype(np.int32)
+        for path_m in (transient.path_near_m.astype(np.float64), transient.path_far_m.astype(np.float64))
+    )
+    ends = np.cumsum(far_bin - near_bin + 1, dtype=np.int64)
+    at = 0
+    while at < transient.returns:
+        part = slice(at, max(at + 1, np.searchsorted(ends, ends[at] + ENTRIES)))
+        at = part.stop
+        near, far = (
+            (path_m[part].astype(np.float64) - start_m) / width_m
+            for path_m in (transient.path_near_m, transient.path_far_m)
+        )
+        first = near_bin[part].astype(np.int64)
+        count = far_bin[part] - first + 1
         which = np.repeat(np.arange(len(near)), count)
         column = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + first[which]
         length = far[which] - near[which]
@@ -205,5 +220,7 @@ def dense_path_histogram(transient: Transient, bins: int, width_m: float, start_
         fraction = np.divide(overlap, length, out=np.ones_like(overlap), where=length > 0)
         kept = (column >= 0) & (column < bins)
         energy = fraction * transient.radiance[part].astype(np.float64)[which]
-        data += np.bincount((pixel[part][which] * bins + column)[kept], energy[kept], minlength=len(data))
+        begin, end = pixel[part.start] * bins, (pixel[at - 1] + 1) * bins  # returns are in the order of their pixels
+        place = (pixel[part][which] * bins + column)[kept] - begin
+        data[begin:end] += np.bincount(place, energy[kept], minlength=end - begin)
     return data.reshape(transient.height, transient.width, bins).astype(np.float32)

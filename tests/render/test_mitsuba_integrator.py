@@ -2,13 +2,14 @@
 
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from render.backend.llvm import start_mitsuba
 from render.engine import render
-from render.mitsuba_integrator import dense_path_histogram, register_integrator
+from render.mitsuba_integrator import dense_path_histogram, register_integrator, scene_from_mitsuba
 from render.settings import RenderSettings
 from render.transient import Transient
 from scenes.errors import InputError
@@ -103,6 +104,46 @@ def test_returns_are_spread_by_overlap():
         **layers,
     )
     assert dense_path_histogram(transient, 3, 1.0, 1.0)[0, 0].tolist() == [2, 3, 1]
+
+
+def test_returns_are_binned_part_by_part_in_any_number_of_bins(monkeypatch):
+    """Many wide returns, and points between them, in parts that end anywhere within a pixel."""
+    random = np.random.default_rng(3)
+    near = np.sort(random.uniform(0, 9, (12, 20)), axis=1).ravel().astype(np.float32)
+    layer = np.zeros((3, 4), np.float32)
+    transient = Transient(
+        height=3,
+        width=4,
+        offsets=np.arange(13) * 20,
+        path_near_m=near,
+        path_far_m=near + (random.uniform(0, 9, 240) * (random.uniform(0, 1, 240) < 0.7)).astype(np.float32),
+        radiance=random.uniform(0, 1, 240).astype(np.float32),
+        bounces=np.ones(240, np.uint8),
+        depth_m=layer + 1,
+        normal=np.zeros((3, 4, 3), np.float16),
+        albedo=layer.astype(np.float16),
+        ambient=layer,
+        mixed=layer > 0,
+        error=layer,
+    )
+    whole = dense_path_histogram(transient, 10000, 1e-3, 2.0)
+    monkeypatch.setattr("render.mitsuba_integrator.ENTRIES", 20000)
+    tracemalloc.start()
+    parts = dense_path_histogram(transient, 10000, 1e-3, 2.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(parts, whole, rtol=1e-6)
+    assert peak < 12 * 120000 + 30000 * 150
+
+
+def test_a_material_whose_back_is_black_in_mitsuba_is_named(capfd):
+    scene, level = mi.load_dict(wall()), mi.log_level()
+    mi.set_log_level(mi.LogLevel.Warn)
+    try:
+        scene_from_mitsuba(scene, scene.sensors()[0])
+    finally:
+        mi.set_log_level(level)
+    assert "shapes without twosided reflect from both sides here: wall" in "".join(capfd.readouterr())
 
 
 @pytest.mark.parametrize(
