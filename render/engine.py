@@ -45,7 +45,6 @@ MENTIONED = 1e-3  # share of ambient light left out beyond, above which the plan
 # Paths traced on top are at most so many times those traced before, pass by pass; filtered light has no pilot. The last
 # pass is for targets that are missed, not for the margin below, and by no more than twice as many paths may gain.
 MAX_MORE, MAX_MORE_FILTERED, MAX_MORE_HOPELESS = (3.0, 1.0, 1.0), (15.0, 15.0, 15.0), 1.0
-CLEAR = 3  # standard deviations above which a bias is believed
 MIN_ALLOWED = 0.25
 
 

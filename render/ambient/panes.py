@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from render.backend.drjit_types import Array, Interactions, LobeSamples, Masks, Rays, Vectors
-from render.scene.rays import MAX_LAYERS, ray_to, shape_index, spawn
+from render.scene.rays import MAX_LAYERS, pane_transmittance, ray_to, shape_index, spawn
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi
 
 MIRRORS = {"conductor", "plastic", "dielectric", "thindielectric"}  # materials with a lobe of no width
@@ -35,9 +35,8 @@ def mirrored_direction(ray: Rays, si: Interactions) -> Array:
 
 
 def _transmission(ior: Array, ray: Rays, si: Interactions) -> Array:
-    """Compute the transmittance of a thin pane with all its inner reflections, (1 - F) / (1 + F)."""
-    fresnel = mi.fresnel(dr.abs(dr.dot(ray.d, si.n)), dr.maximum(ior, 1.0001))[0]
-    return (1 - fresnel) / (1 + fresnel)
+    """Compute the transmittance of the thin pane that a ray hits."""
+    return pane_transmittance(mi.fresnel(dr.abs(dr.dot(ray.d, si.n)), dr.maximum(ior, 1.0001))[0])
 
 
 @dr.syntax

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Interactions, Masks, Rays, UInts, Vectors
-from render.scene.rays import camera_rays, first_opaque, laser_leg, shape_index, to_camera
+from render.scene.rays import camera_rays, first_opaque, laser_leg, shape_index, tangent_motion, to_camera
 from render.scene.refraction import bundle_of, refracted_hit
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
@@ -249,21 +249,11 @@ def _glint(
 def _slopes(
     local: Vectors, normal: Vectors, from_laser: Vectors, distance: Floats, colocated: bool
 ) -> tuple[Array, Array, Array]:
-    """Change of distance and of path length per unit of camera-frame x and y (z = 1), (2,) each, and of the point [m].
-
-    On the tangent plane n . (p - C) = const the distance along l = (x, y, 1) is rho = const |l| / (n . l), so
-    drho/dx = rho (x / |l|^2 - n_x / (n . l)), and dp/dx = (drho/dx) r + rho (e_x / |l| - l x / |l|^3).
-    """
-    inverse = dr.rcp(dr.dot(normal, local))
-    length2 = dr.squared_norm(local)
-    along = dr.normalize(local)
-    to_point = along if colocated else dr.normalize(from_laser)
+    """Change of distance and of path length per unit of camera-frame x and y (z = 1), (2,) each, and of the point [m],
+    on the tangent plane."""
+    to_point = dr.normalize(local) if colocated else dr.normalize(from_laser)
     slopes, path_slopes, extent2 = [], [], Float(0)
-    for axis in range(2):
-        slope = distance * (local[axis] / length2 - normal[axis] * inverse)
-        unit = mi.Vector3f(1, 0, 0) if axis == 0 else mi.Vector3f(0, 1, 0)
-        sideways = distance * (unit - along * (local[axis] * dr.rsqrt(length2))) * dr.rsqrt(length2)
-        moved = along * slope + sideways
+    for slope, moved in tangent_motion(local, normal, distance):
         slopes.append(slope)
         path_slopes.append(slope + dr.dot(to_point, moved))
         extent2 += dr.squared_norm(moved)

@@ -63,7 +63,7 @@ def direct_light(
     - it and a neighbouring cell lie on different surfaces, or one is in shadow, or one is painted darker: an edge runs
       through one of them.
       An edge that could change less than `edge_threshold` of a first cell's energy, in a pixel of the root mean square
-      of all pixels' radiance, is left alone; by default `default_edge_threshold` the grid.
+      of its group's radiance, is left alone; by default `default_edge_threshold` the grid.
     New cells are compared with their neighbours too, of whatever size and pixel, and those are cut in turn: a wire
     thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. Footprints
     not small at the end are clipped to the face they lie on, and counted if that changes them.
@@ -71,8 +71,8 @@ def direct_light(
     Small cells that are not cut, and whose neighbours lie on the same surface, take their spread of path lengths from
     them instead of from the tangent plane (`render.direct.edges.first_edges`).
 
-    Pixels are treated in groups of whole rows, at least MIN_ROWS and about LANES rays each. Neither across edges of
-    groups nor, where not all pixels are asked for, across edges of pixels are cells compared.
+    Pixels are treated in groups of whole rows, at least MIN_ROWS and about RAYS_PER_LAUNCH rays each. Neither across
+    edges of groups nor, where not all pixels are asked for, across edges of pixels are cells compared.
     """
     edge_threshold = default_edge_threshold(grid) if edge_threshold is None else edge_threshold
     width = world.scene.camera.width

@@ -72,6 +72,26 @@ def ray_to(si: Interactions, point: Vectors) -> Array:
     return mi.Ray3f(start, way / length, length * (1 - mi.math.ShadowEpsilon), 0, mi.Color0f())
 
 
+def pane_transmittance(fresnel: Floats) -> Array:
+    """Return what a thin pane lets through, with all its inner reflections: (1 - F) / (1 + F)."""
+    return (1 - fresnel) / (1 + fresnel)
+
+
+def tangent_motion(local: Vectors, normal: Vectors, distance: Floats) -> list[tuple[Array, Array]]:
+    """Return how a ray's distance, and its end [m], change per unit of camera-frame x, and of y (z = 1).
+
+    On the tangent plane n . (p - C) = const the distance along l = (x, y, 1) is rho = const |l| / (n . l), so
+    drho/dx = rho (x / |l|^2 - n_x / (n . l)), and dp/dx = (drho/dx) r + rho (e_x / |l| - l x / |l|^3).
+    """
+    inverse, length2, along = dr.rcp(dr.dot(normal, local)), dr.squared_norm(local), dr.normalize(local)
+    motion = []
+    for axis, unit in enumerate((mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0))):
+        slope = distance * (local[axis] / length2 - normal[axis] * inverse)
+        sideways = distance * (unit - along * (local[axis] * dr.rsqrt(length2))) * dr.rsqrt(length2)
+        motion.append((slope, along * slope + sideways))
+    return motion
+
+
 def sample_bsdf(si: Interactions, random: Generators, active: Masks) -> tuple[Array, Array]:
     """Sample a direction of a surface's lobes, and its weight: reflectance times cosine over density."""
     first, second = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
@@ -131,8 +151,7 @@ def _pass_layers(
         si = found.compute_surface_interaction(ray, mi.RayFlags.All, hit if world.has_cutouts else glass)
         cosine = dr.dot(ray.d, si.n)
         fresnel = mi.fresnel(dr.abs(cosine), dr.maximum(dr.maximum(solid, thin), 1.0001))[0]
-        # one interface lets 1 - F through; a thin pane, with all its inner reflections, (1 - F) / (1 + F)
-        crossing = dr.select(thin > 0, (1 - fresnel) / (1 + fresnel), 1 - fresnel)
+        crossing = dr.select(thin > 0, pane_transmittance(fresnel), 1 - fresnel)
         transmission = dr.select(glass, transmission * crossing, transmission)
         interface = glass & (solid > 0)
         medium = dr.select(interface & (medium == 0), dr.select(cosine > 0, solid, 1), medium)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Masks, Rays
-from render.scene.rays import MAX_LAYERS, camera_rays, shape_index, spawn
+from render.scene.rays import MAX_LAYERS, camera_rays, pane_transmittance, shape_index, spawn
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi
 
 # Half the distance between a bundle's rays, per unit of the image plane at distance 1: less is lost in float32.
@@ -92,7 +92,7 @@ def _refract(world: TracedScene, ray: Rays, active: Masks) -> tuple[Array, ...]:
         index = dr.select(medium == 1, dr.maximum(solid, 1.0001), dr.rcp(dr.maximum(medium, 1.0001)))
         fresnel = mi.fresnel(cosine, index)[0]
         of_pane = mi.fresnel(cosine, dr.maximum(thin, 1.0001))[0]
-        transmission *= dr.select(crossed, 1 - fresnel, dr.select(pane, (1 - of_pane) / (1 + of_pane), 1))
+        transmission *= dr.select(crossed, 1 - fresnel, dr.select(pane, pane_transmittance(of_pane), 1))
         length = dr.select(passing, dr.norm(si.p - start), 0)
         before += length * medium
         apparent += length / medium

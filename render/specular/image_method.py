@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Masks, Rays, UInts, Vectors
-from render.scene.rays import camera_rays, first_opaque, in_beam, passage, shape_index, spawn, spreading
+from render.scene.rays import camera_rays, first_opaque, in_beam, passage, shape_index, spawn, spreading, tangent_motion
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, upload
 from render.settings import MAX_BOUNCES
 from render.specular.mirrors import (
@@ -375,17 +375,11 @@ def _half_width(
     """Compute the half width [m] of the path lengths over a cell of angular size `pitch`, sqrt(a^2 + b^2), by the
     tangent plane.
 
-    In the unfolded camera's frame the point seen along l = (x, y, 1) lies at rho = const |l| / (n . l), so
-    drho/dx = rho (x / |l|^2 - n_x / (n . l)) and dp/dx = (drho/dx) r + rho (e_x / |l| - l x / |l|^3); the path's half
-    span is a = |drho/dx + dp/dx . w| dx/2, with w the unit vector from the laser's image.
+    In the unfolded camera's frame the path's half span is a = |drho/dx + dp/dx . w| dx/2 (`tangent_motion`), with w the
+    unit vector from the laser's image.
     """
     normal, from_laser = (mi.Vector3f(*(dr.dot(axis, v) for axis in axes)) for v in (normal, from_laser))
-    inverse, length2 = dr.rcp(dr.dot(normal, local)), dr.squared_norm(local)
-    along = dr.normalize(local)
     total = Float(0)
-    for axis in range(2):
-        slope = distance * (local[axis] / length2 - normal[axis] * inverse)
-        unit = mi.Vector3f(1, 0, 0) if axis == 0 else mi.Vector3f(0, 1, 0)
-        sideways = distance * (unit - along * (local[axis] * dr.rsqrt(length2))) * dr.rsqrt(length2)
-        total += dr.square((slope + dr.dot(from_laser, along * slope + sideways)) * pitch / 2)
+    for slope, moved in tangent_motion(local, normal, distance):
+        total += dr.square((slope + dr.dot(from_laser, moved)) * pitch / 2)
     return dr.sqrt(total)
