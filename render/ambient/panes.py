@@ -63,7 +63,9 @@ def straight_transmission(world: TracedScene, si: Interactions, point: Vectors, 
             transmission = dr.select(hit, transmission * let, transmission)
             layer += 1
             searching = passing & (layer < MAX_LAYERS)
-            ray = spawn(other, ray.d)
-            ray.maxt = dr.dot(end - ray.o, ray.d)
-            searching &= ray.maxt > 0
+            # it begins a little beside the line, and is aimed again: what the end lies on does not stop it
+            onward = spawn(other, ray.d)
+            way = end - onward.o
+            searching &= dr.dot(way, ray.d) > 0
+            ray = mi.Ray3f(onward.o, dr.normalize(way), dr.norm(way), 0, mi.Color0f())
     return transmission

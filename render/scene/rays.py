@@ -271,18 +271,12 @@ def segment(
     `spread` off, as for the radiance that a camera sees.
     """
     distance = dr.norm(point - si.p)
+    ray = ray_to(si, point)
     if not world.sees_through:
-        ray = spawn(si, point - si.p)
-        way = point - ray.o
-        length = dr.norm(way)
-        ray = mi.Ray3f(ray.o, way / length, length * (1 - mi.math.ShadowEpsilon), 0, mi.Color0f())
         return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), distance
-    ray = spawn(si, point - si.p)
-    way = point - ray.o
-    length = dr.norm(way)
     # not as far as a surface that the point may lie on, nor as what a ray from there would miss
+    length = dr.norm(point - ray.o)
     short = length - dr.maximum(1e-4 * length, mi.math.RayEpsilon * dr.max(dr.abs(point)))
-    ray.d = way / length
     transmission, optical, shortening = passage(world, ray, ray.o, short, active, in_air=False)
     factor = spreading(distance, shortening) if spread else 1
     return transmission * factor, optical + (distance - short)
