@@ -71,7 +71,8 @@ def dense(seen: Transient | Histogram, sensor: Sensor | str | Path | None = None
     Raises
     ------
     InputError
-        For what is neither, a sensor beside a histogram, one of zones, and arrays beyond the memory limit.
+        For what is neither, a sensor beside a histogram, one of zones or, beside a transient, with converters (their
+        bins are unequal, and differ from pixel to pixel), and arrays beyond the memory limit.
 
     Examples
     --------
@@ -112,9 +113,13 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 
 def dense_radiance(transient: Transient, sensor: Sensor) -> dict[str, np.ndarray]:
-    """Return radiance (H, W, T) float32 in a sensor's bins after its pulse, with the arrays beside it."""
+    """Return radiance (H, W, T) float32 in a sensor's bins after its pulse, with the arrays beside it.
+
+    Raises InputError for a sensor with converters, and for arrays beyond the memory limit.
+    """
     from spad.detection.flux import signal_per_bin  # which imports torch
 
+    sensor.check_equal_bins("a dense transient")
     pixels = transient.height * transient.width
     require_memory(4 * pixels * sensor.bins, f"a dense transient of {pixels} pixels and {sensor.bins} bins")
     data, wrapped, recorded = np.empty((pixels, sensor.bins), np.float32), 0.0, 0.0

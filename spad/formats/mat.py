@@ -85,13 +85,14 @@ def pile_up_warning(histogram: Histogram) -> str | None:
 
 def check_mat(path: Path, sensor: Sensor, height: int, width: int, baseline_m: tuple[float, ...] = CO_LOCATED) -> None:
     """Raise InputError in one line for what the layout cannot hold: a laser beside the camera, bins that do not cover
-    the period, too large a frame, and the pulse of another sensor in the folder."""
+    the period or are unequal, too large a frame, and the pulse of another sensor in the folder."""
     bins, period = sensor.bins, sensor.bins_per_period
     require(path.suffix == ".mat", f"{path}: the output must end in .mat")
     place = " ".join(f"{1e3 * value:g}" for value in baseline_m)
     require(not any(baseline_m), f"{path}: the layout knows no laser beside the camera, this one is at {place} mm")
     uncovered = f"the layout needs bins that cover the period, {sensor.name} has {bins} of {period}"
     require(bins == period, f"{path}: {uncovered}")
+    sensor.check_equal_bins(f"{path}: the layout")
     size = 8 * height * width * bins
     require(size < 2**31, f"{path}: {height} x {width} x {bins} rates take {size} bytes, a version 5 file holds 2^31")
     pulse = _pulse_file(path, height, width)

@@ -211,6 +211,11 @@ class Sensor:
         inside = 0 <= offset_m < self.range_m
         require(inside, f"offset {offset_m:g} m is outside 0 to the sensor's range {self.range_m:.4f} m")
 
+    def check_equal_bins(self, where: str) -> None:
+        """Raise InputError where converters make bins unequal; `where`, what needs equal ones, comes first."""
+        unequal = f"{where}: the converters (tdc) of {self.name} make bins unequal, expected equal ones"
+        require(self.tdc is None, f"{unequal}; take the sensor without them")
+
     @property
     def bin_depth_m(self) -> float:
         """Return the depth [m] that one bin spans, c bin_width / 2."""

@@ -243,6 +243,7 @@ def test_points_lie_at_the_depth_that_is_given():
         (lambda t, h: s2s.dense(3), "dense: expected a Transient or a Histogram, not int"),
         (lambda t, h: s2s.dense(h, SENSOR), "dense: a histogram has a sensor of its own"),
         (lambda t, h: s2s.dense(t, "tmf8820"), "tmf8820 has zones"),
+        (lambda t, h: s2s.dense(t, "reference-tdc"), r"a dense transient: the converters .* of reference-tdc"),
         (lambda t, h: s2s.dense(replace(h, meta={"a": object()})), "dense: the metadata hold what JSON cannot"),
         (lambda t, h: s2s.write_dense(h, "a.npz"), "write_dense: expected a dict of `dense`, not Histogram"),
         (lambda t, h: s2s.write_dense({"weights": np.ones(3)}, "a.npz"), "a.npz: weights is no array of `dense`"),

@@ -247,6 +247,10 @@ def test_foreign_mat_files_are_refused_in_one_line(tmp_path: Path) -> None:
     gated = replace(made(), sensor=Sensor(period_s=2 * Sensor().period_s))
     with pytest.raises(InputError, match="cover the period"):
         write_mat(gated, tmp_path / "g.mat")
+    timed = replace(made(), sensor=sensor_by_name("reference-tdc"))
+    with pytest.raises(InputError, match=r"g\.mat: the layout: the converters \(tdc\) of reference-tdc"):
+        write_mat(timed, tmp_path / "g.mat")
+    assert not (tmp_path / "g.mat").exists()
 
 
 # Radiometric budget: the worked example of docs/radiometric.md
