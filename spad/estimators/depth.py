@@ -153,8 +153,8 @@ def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched", 
     It is the depth where the laser is co-located with the camera. Counts know no laser: `histogram_depth_m` takes a
     `Histogram`, which does, and gives the depth beside a displaced one too. `law` is the detection law whose losses
     `coates` undoes; None stands for that of the sensor's detector (`spad.estimators.pile_up.linearised`). Raises
-    InputError for an unknown method, a wrong number of bins, negative or non-finite counts, and with `coates` for
-    counts that the law cannot have made.
+    InputError for an unknown method, a wrong number of bins, negative or non-finite counts, and with `coates` for an
+    unknown law, and counts that the law cannot have made.
     """
     _require_method(method)
     rows = checked_histogram(counts, sensor.bins)
@@ -178,6 +178,7 @@ def confidence(
     estimates them. NaN where the depth is. Of any method's depth; that of `coates` is judged by counts without the
     pile-up of `law`, as it was estimated. Raises InputError as `estimate_depth` does.
     """
+    _require_method(method)
     rows = checked_histogram(counts, sensor.bins)
     if depth_m.shape != counts.shape[:-1]:
         raise InputError(f"depth of shape {tuple(depth_m.shape)} for counts of shape {tuple(counts.shape)}")

@@ -7,7 +7,8 @@ import logging
 import torch
 from torch import Tensor
 
-from scenes.errors import InputError
+from scenes.errors import InputError, require_choice
+from spad.detection.detectors import LAWS
 from spad.detection.laws import LOW_FLUX
 from spad.sensor.model import Sensor
 
@@ -94,7 +95,10 @@ def warn_of_saturation(counts: Tensor, sensor: Sensor, law: str | None = None) -
 
 
 def _law(sensor: Sensor, law: str | None) -> str:
-    return law or ("first-photon" if sensor.armed_every_cycle else "free-running")
+    if law is not None:
+        require_choice(law, LAWS, "detection law")
+        return law
+    return "first-photon" if sensor.armed_every_cycle else "free-running"
 
 
 def _too_few(detections: Tensor, sensor: Sensor) -> Tensor:

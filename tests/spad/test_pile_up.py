@@ -9,7 +9,7 @@ from test_laws import same
 
 from scenes.errors import InputError
 from spad.detection.detect import choose_model, sense
-from spad.estimators.depth import confidence_map, detection_law, estimate_depth, histogram_depth_m
+from spad.estimators.depth import confidence, confidence_map, detection_law, estimate_depth, histogram_depth_m
 from spad.estimators.pile_up import coates, free_running_flux, linearised
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
@@ -74,6 +74,23 @@ def test_without_a_stated_law_it_is_the_detectors() -> None:
     assert torch.equal(linearised(rows, sensor), coates(rows, 100) * 100)
     free = replace(sensor, reset="free-running", dead_time_s=2e-9)
     assert torch.equal(linearised(rows, free), free_running_flux(rows, 100, free) * 100)
+
+
+def test_an_unknown_law_or_method_is_refused() -> None:
+    """A misspelt law would be undone as another one, and a misspelt method's confidence be that of raw counts."""
+    counts = torch.ones((1, 64))
+    sensor = Sensor(bins=64, exposure_s=100 * Sensor(bins=64).period_s)
+    depth_m = estimate_depth(counts, sensor, "coates", law="first-photon")
+    known = "poisson, first-photon, free-running"
+    for refused in (
+        lambda: linearised(counts, sensor, "first_photon"),
+        lambda: estimate_depth(counts, sensor, "coates", law=""),
+        lambda: confidence(counts, depth_m, sensor, "coates", law="first_photon"),
+    ):
+        with pytest.raises(InputError, match=rf"^detection law '\w*' is unknown, expected one of {known}$"):
+            refused()
+    with pytest.raises(InputError, match="depth method 'Coates' is unknown"):
+        confidence(counts, depth_m, sensor, "Coates")
 
 
 def test_pile_up_of_zones_is_not_undone() -> None:
