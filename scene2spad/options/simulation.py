@@ -59,7 +59,8 @@ class Sense(Common):
     pulse_tail: float = 0.0
     """Time constant of its exponential tail [s]; needs --pulse-fwhm."""
     pde: Number = None
-    """Photon detection efficiency, 0 to 1: a --radiometric budget counts with it (default: the preset's)."""
+    """Photon detection efficiency, fill factor included, 0 to 1: a --radiometric budget counts with it (default: the
+    preset's)."""
     crosstalk: Number = None
     """Probability that a detection fires a given neighbour (default: the preset's)."""
     hot_pixels: Number = None
@@ -77,7 +78,7 @@ class Sense(Common):
     f_number: Number = None
     """Focal length over aperture diameter (default: the sensor file's, or 2)."""
     pixel_pitch: Number = None
-    """Side of a pixel's active square [m] (default: the sensor file's, or 20e-6)."""
+    """Distance from pixel to pixel [m]; the fill factor is part of --pde (default: the sensor file's, or 20e-6)."""
     transmission: Number = None
     """Transmission of lens and filter (default: the sensor file's, or 0.8)."""
     filter_width: Number = None

@@ -31,7 +31,7 @@ class Optics:
 
     pulse_energy_j    energy of one laser pulse, over the whole cone; 0: the laser is off
     focal_length_m, f_number    aperture diameter = focal length / f-number
-    pixel_pitch_m     side of a pixel's active square (fill factor included)
+    pixel_pitch_m     from pixel to pixel; how much of that square is active is part of the sensor's `pde`
     transmission      of lens and filter at the laser's wavelength
     filter_nm         width of the band that the filter lets through
     wavelength_m      of the laser

@@ -109,6 +109,14 @@ def test_what_only_pixels_have_is_refused_beside_zones(key):
         SensorFile(replace(WHOLE, **only), zones=ZONES)
 
 
+def test_presets_say_that_their_efficiency_holds_the_fill_factor():
+    """A pixel's pitch is from pixel to pixel, so that only the efficiency can hold it."""
+    for name, path in preset_files().items():
+        found = read_sensor(path)
+        source = found.sources.get("detector.pde", "")
+        assert (found.sensor.pde == 1) or "fill factor" in source or "of the area that is active" in source, name
+
+
 def test_numbers_that_no_float_holds_are_refused_in_tables_too():
     tables = {"name": "x", "histogram": {"bins": 8, "bin_width": "1 ns"}, "pulse": {"sigma": "1 ns"}}
     with pytest.raises(InputError, match=r"detector\.pde: a whole number of more than 308 digits"):
