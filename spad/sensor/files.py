@@ -125,7 +125,7 @@ class SensorFile:
     """Contents of a sensor file.
 
     sensor       the detector and its histogram
-    optics       lens, filter and laser of a radiometric budget; None where the file has none
+    optics       lens, filter and laser of a radiometric budget; None where the file has none, and beside zones
     zones        zones of a multi-zone sensor; None for one that has pixels
     description  one line for people
     sources      where the numbers come from, by "table.key"; what is not public says "assumed"
@@ -141,6 +141,7 @@ class SensorFile:
         if self.zones is not None:
             check_times(self.sensor, self.zones)
             self._check_no_pixels()
+            require(self.optics is None, "zones and optics do not go together: a radiometric budget is of pixels")
 
     def _check_no_pixels(self) -> None:
         """Raise InputError for what only pixels have, and zones would leave without a meaning.

@@ -34,8 +34,8 @@ class Sensor:
     pulse, jitter         the laser's pulse and the detector's timing jitter, a second kernel; `response` is both
     period_s              laser period, a whole number of bin widths (None: the histogram covers it); time wraps at it
     exposure_s            exposure of one frame; cycles = exposure / period, of which the nearest whole number is drawn
-    pde                   photon detection efficiency at the laser's wavelength, fill factor included: radiometric budgets
-                          count with it
+    pde                   photon detection efficiency at the laser's wavelength, fill factor included; radiometric
+                          budgets count with it
     dark_count_rate_hz    dark counts per second and pixel, uniform in time: a number, or one for each image row, used
                           again from the first where the image has more rows
     hot_share, hot_rate_hz   share of pixels, drawn at random, that have this dark count rate instead, above 0

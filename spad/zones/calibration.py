@@ -154,7 +154,7 @@ def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str)
     )
     sources.update(dict.fromkeys(keys, how))
     sensor = replace(fitted.sensor, name=name)
-    return SensorFile(sensor, start.optics, fitted.zones, f"{start.sensor.name}, {how}", sources)
+    return SensorFile(sensor, None, fitted.zones, f"{start.sensor.name}, {how}", sources)
 
 
 def poisson_deviance(counts: np.ndarray, expected: np.ndarray) -> float:

@@ -91,7 +91,7 @@ ZONES = ZoneArray(
 @pytest.mark.parametrize("sensor", [*PRESETS.values(), WIDE, WHOLE], ids=lambda sensor: sensor.name)
 @pytest.mark.parametrize("optics", [None, Optics(1e-9 / 3, 4e-4, 1.33, 2.55e-5, 0.7, 12.3, 9.4e-7)])
 def test_a_sensor_comes_back_from_its_file_to_the_last_bit(sensor, optics, tmp_path):
-    zones = None if sensor is WIDE else ZONES
+    zones = None if sensor is WIDE or optics is not None else ZONES
     whole = SensorFile(sensor, optics, zones, 'all "fields"', {"histogram.bins": "a\nsheet"})
     assert read_sensor(write_sensor(whole, tmp_path / "s.toml")) == whole
 
@@ -107,6 +107,12 @@ def test_what_only_pixels_have_is_refused_beside_zones(key):
     only = {DETECTOR[key].field: getattr(WIDE, DETECTOR[key].field) for key in keys}
     with pytest.raises(InputError, match=rf"zones and detector\.{key} do not go together: it is of pixels"):
         SensorFile(replace(WHOLE, **only), zones=ZONES)
+
+
+def test_optics_are_refused_beside_zones():
+    """A radiometric budget is of pixels: nothing would read them."""
+    with pytest.raises(InputError, match="zones and optics do not go together: a radiometric budget is of pixels"):
+        SensorFile(WHOLE, Optics(1e-9, 4e-4, 1.33, 2.55e-5), ZONES)
 
 
 def test_presets_say_that_their_efficiency_holds_the_fill_factor():
