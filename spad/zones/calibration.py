@@ -60,6 +60,7 @@ class Calibration:
     errors            standard error of each natural parameter by name, as `natural` orders them
     deviance          Poisson deviance a bin of the captures used
     values, basis     the fit's own parameters
+    free              effects that were fitted, of OPTIONAL; the others are off, and the width of a bin is the start's
     """
 
     sensor: Sensor
@@ -68,6 +69,7 @@ class Calibration:
     deviance: float
     values: Values
     basis: PulseBasis
+    free: tuple[str, ...]
 
 
 # From the fit's parameters to a sensor
@@ -144,15 +146,14 @@ def as_sensor(model: ZoneModel, values: Values, sensor: Sensor, zones: ZoneArray
 
 
 def calibrated_file(start: SensorFile, fitted: Calibration, name: str, how: str) -> SensorFile:
-    """Return the sensor file of a calibration; the sources of what was not fitted are kept."""
-    sources = {key: source for key, source in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
-    keys = (
-        "histogram.bin_width",
-        "pulse.samples",
-        "pulse.step",
-        *(f"zones.{key}" for key in ("gain", *OPTIONAL) if key != "bin_width"),
-    )
-    sources.update(dict.fromkeys(keys, how))
+    """Return the sensor file of a calibration; the sources of what it left as it was are kept, and effects that are off
+    have none."""
+    key_of = {name: "histogram.bin_width" if name == "bin_width" else f"zones.{name}" for name in OPTIONAL}
+    off = {key_of[name] for name in _OFF}
+    kept = {key: source for key, source in start.sources.items() if not key.startswith(("pulse.", "jitter."))}
+    sources = {key: source for key, source in kept.items() if key not in off}
+    fitted_keys = ("pulse.samples", "pulse.step", "zones.gain", *(key_of[name] for name in fitted.free))
+    sources.update(dict.fromkeys(fitted_keys, how))
     sensor = replace(fitted.sensor, name=name)
     return SensorFile(sensor, None, fitted.zones, f"{start.sensor.name}, {how}", sources)
 
@@ -284,7 +285,8 @@ def calibrate(
     calibrated = as_sensor(model, values, sensor, zones)
     bins = sum(capture.counts.size for capture in captures)
     deviance = sum(poisson_deviance(c.counts, model.expected(values, c)) for c in captures) / bins
-    return Calibration(*calibrated, standard_errors(model, values, information, names), deviance, values, basis)
+    errors = standard_errors(model, values, information, names)
+    return Calibration(*calibrated, errors, deviance, values, basis, tuple(free))
 
 
 def _basis_for(captures: Sequence[ZoneCapture], sensor: Sensor, reference: int) -> PulseBasis:

@@ -85,7 +85,7 @@ def return_speeds(distance_m: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return found
 
 
-def check_fit(fitted: Calibration, counts: np.ndarray, free: Sequence[str]) -> None:
+def check_fit(fitted: Calibration, counts: np.ndarray) -> None:
     """Raise InputError for a calibration of counts (N, Z, T) that says nothing of the sensor.
 
     Gains have to be known better than to their own size in most zones. Where the background is fitted, the deviance of
@@ -99,5 +99,5 @@ def check_fit(fitted: Calibration, counts: np.ndarray, free: Sequence[str]) -> N
     deviance = fitted.deviance if fitted.deviance < math.inf else math.inf  # NaN is no fit, either
     misfit = math.sqrt(max(0.0, deviance - POISSON_DEVIANCE) / float(counts.mean()))
     message = f"the fit is wrong by {misfit:.0%} of a bin's counts, deviance {fitted.deviance:.3g} a bin"
-    good = "background" not in free or misfit < MISFIT_LIMIT
+    good = "background" not in fitted.free or misfit < MISFIT_LIMIT
     require(good, f"{message}, expected below {MISFIT_LIMIT:.0%}: {WRONG}")

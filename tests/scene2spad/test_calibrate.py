@@ -83,7 +83,7 @@ def test_parameters_that_the_captures_do_not_know_are_warned_of(caplog):
     zones = replace(load_sensor("tmf8820").zones, trials=(1e6,) * 8 + (math.inf,), leak=(0.0,) * 8 + (3.0,))
     known = {name: np.zeros(9) for name in ("gain", "skew_s", "background", "echo_m2", "recovery", "compression")}
     errors = known | {"trials": np.full(9, 2e6), "leak": np.ones(9), "crosstalk": np.zeros(1)}
-    warn_of_unknown(Calibration(Sensor(), zones, errors, 1.0, {}, PulseBasis.made(0, 2, 2)))
+    warn_of_unknown(Calibration(Sensor(), zones, errors, 1.0, {}, PulseBasis.made(0, 2, 2), ()))
     (record,) = caplog.records
     assert record.message == "standard error larger than the value, so that it is not known: trials of 8 zones"
 

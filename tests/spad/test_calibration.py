@@ -8,12 +8,15 @@ import pytest
 
 from scenes.errors import InputError
 from spad.detection.saturation import draw_saturated
+from spad.sensor.files import SensorFile
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import Pulse
 from spad.sensor.zone_array import ZoneArray, check_times, largest_chirp
 from spad.zones.calibration import (
+    Calibration,
     as_sensor,
     calibrate,
+    calibrated_file,
     check_returns,
     middle_capture,
     natural,
@@ -93,6 +96,19 @@ def test_the_fits_model_is_the_sensors():
         values["leak"] = 0 * values["leak"]
         direct = expected_zone_counts(capture.returns, sensor, replace(zones, leak=()), drift)
         assert model.expected(values, capture) == pytest.approx(direct, rel=1e-9, abs=1e-6)
+
+
+def test_the_file_states_the_calibration_as_source_of_what_was_fitted_alone():
+    """What is off has no source; the width of a bin keeps the start's where it is the start's."""
+    model, values = truth()
+    calibrated = as_sensor(model, values, SENSOR, ZONES)
+    before = {"histogram.bin_width": "maker", "zones.delay": "older", "zones.echo": "older", "zones.width": "drawing"}
+    start = SensorFile(SENSOR, zones=ZONES, sources=before | {"pulse.sigma": "maker"})
+    fitted = {"zones.gain": "now", "zones.delay": "now", "pulse.samples": "now", "pulse.step": "now"}
+    for free, width in ((("delay",), "maker"), (("delay", "bin_width"), "now")):
+        found = Calibration(*calibrated, {}, 1.0, values, model.basis, free)
+        sources = calibrated_file(start, found, "mine", "now").sources
+        assert sources == fitted | {"histogram.bin_width": width, "zones.width": "drawing"}
 
 
 def test_the_jacobian_is_the_finite_difference():

@@ -90,22 +90,22 @@ def test_effects_of_time_need_distances(distance_m, words):
 def fitted(**changes) -> Calibration:
     """A calibration that knows its gains to a hundredth, of deviance 1."""
     zones = replace(ZONES, gain=(1.0, 2.0, 3.0))
-    found = Calibration(SENSOR, zones, {"gain": np.array([0.01, 0.02, 0.03])}, 1.0, {}, PulseBasis.made(0, 2, 2))
+    found = Calibration(SENSOR, zones, {"gain": np.array([0.01, 0.02, 0.03])}, 1.0, {}, PulseBasis.made(0, 2, 2), TIMED)
     return replace(found, **changes)
 
 
 def test_a_fit_that_says_nothing_is_refused():
     counts = np.full((4, 3, 64), 100)
-    check_fit(fitted(), counts, TIMED)
-    check_fit(fitted(errors={"gain": np.array([9.0, 0.02, 0.03])}), counts, TIMED)  # one zone alone
+    check_fit(fitted(), counts)
+    check_fit(fitted(errors={"gain": np.array([9.0, 0.02, 0.03])}), counts)  # one zone alone
     for unknown in ([9.0, 9.0, 0.03], [np.nan, np.inf, 0.03]):
         with pytest.raises(InputError, match="the fit knows the gain of 1 of 3 zones"):
-            check_fit(fitted(errors={"gain": np.array(unknown)}), counts, TIMED)
-    check_fit(fitted(deviance=2 + 100 * 0.69**2), counts, TIMED)
+            check_fit(fitted(errors={"gain": np.array(unknown)}), counts)
+    check_fit(fitted(deviance=2 + 100 * 0.69**2), counts)
     for deviance, size in ((2 + 100 * 0.71**2, "71%"), (np.inf, "inf%"), (np.nan, "inf%")):
         with pytest.raises(InputError, match=f"the fit is wrong by {size} of a bin's counts"):
-            check_fit(fitted(deviance=deviance), counts, TIMED)
-        check_fit(fitted(deviance=deviance), counts, ("delay",))  # without a background all bins beside it are wrong
+            check_fit(fitted(deviance=deviance), counts)
+        check_fit(fitted(deviance=deviance, free=("delay",)), counts)  # all bins beside the return are wrong
 
 
 def test_poisson_noise_alone_is_no_misfit():

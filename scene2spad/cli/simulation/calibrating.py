@@ -74,7 +74,7 @@ def run(command: Calibrate, progress: Progress) -> dict:
     held = [one for at, one in enumerate(captures) if at % command.every]
     with _told_of(path):
         fitted = _fitted(used, start.sensor, start.zones, command)
-        check_fit(fitted, tried.counts, command.effects)
+        check_fit(fitted, tried.counts)
     warn_of_unknown(fitted)
     span = f"{chosen.distance_m[0]:g} to {chosen.distance_m[-1]:g} m"
     how = f"{HOW} {len(used)} captures of {path.name}, {span}"
