@@ -226,8 +226,9 @@ def published_from_rgbd(
     beta = round(2 d / (c Delta)) modulo T, 1 or more; S = signal a / d^2 over its mean; A = dark counts + background b
     over its mean, rescaled to the asked mean; rate = S h + A / T with the largest sample of the published taps h at bin
     beta, from 1; the label is beta - 1 bins. Raises InputError for arrays of different shapes, depth that is not
-    finite, bins that do not cover the period, and a pulse of other taps.
+    finite, bins that do not cover the period or are unequal, and a pulse of other taps.
     """
+    sensor.check_equal_bins("published convention")
     depth, albedo, ambient = _alike(depth_m, albedo, ambient)
     require(bool(np.isfinite(depth).all() and (depth > 0).all()), "published convention: every pixel needs a depth")
     require(sensor.bins == sensor.bins_per_period, "published convention: the bins must cover the period")
@@ -257,13 +258,14 @@ def published_taps(sensor: Sensor) -> np.ndarray:
 
     Measured samples in steps of a bin are taken as they are. A Gaussian of L = 2 sigma bins is sampled at
     i = 1 .. floor(8 L) around (8 L - 1) / 2 with sigma = L / 2: at 270 ps and 97.66 ps bins its centroid is 0.44 bins
-    before its largest sample. Raises InputError for other pulses, and more taps than bins.
+    before its largest sample. Raises InputError for other pulses, jitter of detector or clock, and more taps than bins.
     """
+    require(not sensor.jitters, f"published convention: no jitter of detector or clock, sensor {sensor.name} has one")
     pulse, width = sensor.pulse, sensor.bin_width_s
     if isinstance(pulse, SampledPulse) and math.isclose(pulse.sample_s, width, rel_tol=1e-9):
         taps = np.asarray(pulse.samples)
     else:
-        if not isinstance(pulse, Pulse) or pulse.tail_s or sensor.jitter is not None:
+        if not isinstance(pulse, Pulse) or pulse.tail_s:
             raise InputError("published convention: the pulse must be Gaussian, or measured in steps of a bin")
         length = 2 * pulse.sigma_s / width
         sample = np.arange(1, math.floor(8 * length) + 1)

@@ -19,6 +19,7 @@ from spad.formats.mat import read_mat, write_mat
 from spad.formats.rgbd import cosine_of_incidence, from_rgbd, published_from_rgbd, published_taps, transient_from_rgbd
 from spad.sensor.budget import Optics
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.tdc import Tdc
 from spad.sensor_names import sensor_by_name
 
 TRAIN = sensor_by_name("iccv2023-train")
@@ -72,6 +73,18 @@ def test_published_pulses() -> None:
     assert published_taps(TRAIN).argmax() == 6
     with pytest.raises(InputError, match="Gaussian"):
         published_taps(Sensor(pulse=Pulse(1e-10, 1e-10)))
+
+
+@pytest.mark.parametrize("pulse", [Sensor().pulse, TRAIN.pulse], ids=["Gaussian", "measured"])
+def test_the_published_convention_knows_no_jitter_and_no_converters(pulse) -> None:
+    """Of the detector or of the clock, beside either kind of pulse: its taps would be too narrow."""
+    sensor = replace(TRAIN, pulse=pulse, dark_count_rate_hz=0.0)
+    even = Tdc(sensor.period_s / 4, codes=256)
+    for jittery in (replace(sensor, jitter=Pulse(5e-11)), replace(sensor, tdc=replace(even, jitter_s=5e-11))):
+        with pytest.raises(InputError, match="no jitter of detector or clock, sensor iccv2023-train has one"):
+            published_taps(jittery)
+    with pytest.raises(InputError, match="published convention: the converters"):
+        published_from_rgbd(*scene(), replace(sensor, tdc=even), PhotonBudget(1, 1))
 
 
 @pytest.mark.parametrize(("background", "fraction"), [(2, 0.94), (10, 0.76), (50, 0.39)])
