@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from csph.codes.blocks import encode_blocks
-from csph.codes.tensor import CodingTensor
+from csph.codes.tensor import LEVELS, CodingTensor
 from scenes.errors import listed
 
 log = logging.getLogger("csph")
 
 Int8Rule = Literal["calibrated", "published"]
 INT8_RULES: tuple[str, ...] = get_args(Int8Rule)
-LEVELS = 127  # +-: symmetric, -128 is left out so that a sign can always be turned
 FEW_STEPS = 4  # a code whose largest magnitude is fewer tells 8-bit sums next to nothing
 PRODUCT_SHIFT = 7  # bits that the product of two 8-bit factors is shifted by, back into 8 bits
 ACCUMULATOR_BITS = 16

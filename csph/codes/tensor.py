@@ -18,6 +18,9 @@ from csph.codes.photons import encode_photons, photon_table
 from scenes.errors import InputError, require, require_kind, require_kinds, require_number
 from spad.estimators.depth import by_pixels
 
+LEVELS = 127  # +- steps of an 8-bit part: symmetric, -128 is left out so that a sign can always be turned
+WHOLE = 1e-3  # of a step: float32 holds products of steps to a hundredth of that
+
 
 @dataclass(frozen=True, eq=False)
 class CodingTensor:
@@ -32,7 +35,8 @@ class CodingTensor:
               already, as those of a layer trained with `int8`; None for others
 
     Both parts are copied, and kept in float32, also those given in float64 or 16 bits. Raises InputError for other
-    shapes, values that are not finite, or not in float32, more codes than counts, and steps that are not above 0.
+    shapes, values that are not finite, or not in float32, more codes than counts, steps that are not above 0, and
+    parts that are not whole steps, to a thousandth, within +-127.
 
     Examples
     --------
@@ -73,9 +77,23 @@ class CodingTensor:
             shapes = f"temporal part {tuple(self.temporal.shape)} and spatial part {tuple(self.spatial.shape)}"
             require(alike, f"coding tensor {self.name}: {shapes}, expected (K, Mt) and (K, Mr, Mc)")
         if self.steps is not None:
-            object.__setattr__(self, "steps", _pair_of_steps(self.steps, f"coding tensor {self.name}: steps"))
+            self._check_steps(self.steps)
         size = self.bins * self.rows * self.columns
         require(self.codes <= size, f"coding tensor {self.name}: {self.codes} codes of a block of {size} counts")
+
+    def _check_steps(self, steps: object) -> None:
+        """Make the steps a pair of numbers. Raises InputError unless both parts are whole steps within +-LEVELS."""
+        what = f"coding tensor {self.name}: steps"
+        pair = _pair_of_steps(steps, what)
+        for label, part, step in (("temporal", self.temporal, pair[0]), ("spatial", self.spatial, pair[1])):
+            if part is None:
+                continue
+            number = part / step
+            largest, off = float(number.abs().max()), float((number - number.round()).abs().max())
+            what_part = f"{what} of {step:g}: the {label} part"
+            require(largest <= LEVELS + WHOLE, f"{what_part} has up to {largest:g}, limit {LEVELS}")
+            require(off <= WHOLE, f"{what_part} is {off:.2g} off whole ones, limit {WHOLE:g}")
+        object.__setattr__(self, "steps", pair)
 
     @property
     def codes(self) -> int:

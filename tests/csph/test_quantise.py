@@ -9,6 +9,7 @@ from csph.codes.design import Design
 from csph.codes.quantise import PUBLISHED_STEP, encode_int16, published_int8, quantised
 from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer, make_coding
+from scenes.errors import InputError
 
 DESIGNS = (
     Design("fourier", (32, 1, 1), 8),
@@ -140,3 +141,18 @@ def test_published_int8_names_the_rows_that_it_loses(caplog):
     published_int8(CodingTensor("weak as published", torch.tensor([[1.0, -1.0], [1e-3, 0.0]])))
     (told,) = (record.getMessage() for record in caplog.records)
     assert "weak as published: of its 2 codes" in told and "row 1 (0)," in told
+
+
+def test_steps_are_those_that_the_parts_have():
+    """8 bits would clip parts beyond 127 steps, and round those between two, without a word."""
+    temporal, spatial = np.array([[0.3, -12.7], [0.1, 0.0]]), np.array([[[2.0, -4.0]], [[0.0, 254.0]]])
+    found = quantised(CodingTensor("x", temporal, spatial, steps=(0.1, 2.0)))
+    assert found.temporal.tolist() == [[3, -127], [1, 0]] and found.spatial.ravel().tolist() == [1, -2, 0, 127]
+    wide = np.array([[1.0, -1.0], [0.5, -0.5]])
+    for parts, words in (
+        ({"temporal": wide, "steps": (0.001, 1.0)}, "0.001: the temporal part has up to 1000, limit 127"),
+        ({"temporal": temporal, "steps": (0.2, 1.0)}, "0.2: the temporal part is 0.5 off whole ones, limit 0.001"),
+        ({"temporal": temporal, "spatial": spatial, "steps": (0.1, 1.0)}, "1: the spatial part has up to 254"),
+    ):
+        with pytest.raises(InputError, match=f"coding tensor x: steps of {words}"):
+            CodingTensor("x", **parts)
