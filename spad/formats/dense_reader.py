@@ -17,7 +17,7 @@ from scenes.io.inputs import parse_json, regular_file
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.formats.dense import AXES, UNITS
-from spad.measurements.histogram import Histogram
+from spad.measurements.histogram import TRUTH, Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 TEXT = ("axes", "units", "sensor", "meta")  # the others are numbers
 MAX_TEXT_BYTES = 1 << 28
-TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
 BY_HAND = (
     "; in Python scene2spad.Histogram.from_counts takes its counts (H, W, T) with their sensor, and "
     "scene2spad.write_histogram makes the file"
@@ -124,11 +123,11 @@ def _histogram(arrays: dict[str, np.ndarray], text: dict[str, str]) -> Histogram
     fits = counts.ndim == 3 and counts.shape[2] == sensor.bins and math.isclose(width_s, sensor.bin_width_s)
     what = f"data of shape {counts.shape} and bins of {width_s:g} s"
     require(fits, f"{what} do not fit its sensor of {sensor.bins} bins of {sensor.bin_width_s:g} s")
-    known = {name: arrays[name] for name in TRUTH if name != "albedo"}
+    known = {name: arrays[name] for name in TRUTH}
     budget = PhotonBudget(**meta.pop("budget"))
     whole = np.ascontiguousarray(counts, np.int32)
     require(bool((whole == counts).all()), "holds counts above 2^31 - 1")
-    return Histogram(whole, sensor, budget, **known, albedo=arrays["albedo"].astype(np.float16), meta=meta)
+    return Histogram(whole, sensor, budget, **known, meta=meta)
 
 
 def _json(text: dict[str, str], name: str) -> JsonObject:

@@ -26,7 +26,13 @@ FOREIGN = (
     "in Python scene2spad.Histogram.from_counts takes counts (H, W, T), and Histogram.from_timestamps a list of "
     "detections, with their sensor"
 )
-TRUTH = ("depth_m", "mixed", "albedo", "expected_signal", "expected_background")
+TRUTH: dict[str, type[np.generic]] = {  # of every pixel, and the type that it is kept in
+    "depth_m": np.float32,
+    "mixed": np.bool_,
+    "albedo": np.float16,
+    "expected_signal": np.float32,
+    "expected_background": np.float32,
+}
 NOTES = {  # unit and description of every dataset of the file
     "timestamps": ("bins", "time bin of every detection from 0, ascending in a pixel, pixel after pixel in rows"),
     "offsets": ("1", "detections of pixel p are timestamps[offsets[p]:offsets[p + 1]]"),
@@ -52,7 +58,8 @@ class Histogram:
     expected_signal, expected_background   (H, W) float32, detections per pixel and exposure
     meta                 seed, plan, what made the transient: anything JSON holds
 
-    Raises InputError for fields of another kind, arrays of other types or shapes, and values below 0.
+    Truth in numbers of another type is converted. Raises InputError for fields of another kind, counts and masks of
+    another type, other shapes, and values below 0.
 
     Examples
     --------
@@ -84,14 +91,22 @@ class Histogram:
         if self.counts.size and self.counts.min() < 0:
             raise InputError(f"histogram: a bin holds {self.counts.min()} counts")
         for name in TRUTH:
-            array = getattr(self, name)
-            if array.shape != self.counts.shape[:2]:
-                raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
-            if array.dtype.kind == "f" and (np.isinf(array) | (array < 0)).any():
-                raise InputError(f"histogram: {name} holds infinite or negative values")
-            frozen = array.view()  # the caller's own array can still be written to
-            frozen.setflags(write=False)
-            object.__setattr__(self, name, frozen)
+            object.__setattr__(self, name, self._checked_truth(name, getattr(self, name)))
+
+    def _checked_truth(self, name: str, array: np.ndarray) -> np.ndarray:
+        """Return an image of the truth in its own type, to read from; the caller's own can still be written to."""
+        kind = np.dtype(TRUTH[name])
+        if array.shape != self.counts.shape[:2]:
+            raise InputError(f"histogram: {name} is {array.shape}, expected {self.counts.shape[:2]}")
+        # numbers to less precise ones, but no number to a truth value: ~ of the 0s and 1s of a mask is true everywhere
+        fits = np.can_cast(array.dtype, kind, "same_kind")
+        require(fits, f"histogram: {name} is {array.dtype}, expected {kind}")
+        with np.errstate(over="ignore"):  # to infinity, which is refused
+            held = array.astype(kind, copy=False).view()
+        if (np.isinf(held) | (held < 0)).any():
+            raise InputError(f"histogram: {name} holds infinite or negative values")
+        held.setflags(write=False)
+        return held
 
     @classmethod
     def from_counts(cls, counts: np.ndarray, sensor: Sensor | str | Path, meta: JsonObject | None = None) -> Histogram:

@@ -76,6 +76,24 @@ def test_fields_of_a_histogram_are_of_their_kind(changed, message):
         replace(histogram, **changed)
 
 
+@pytest.mark.parametrize("kind", [np.int64, np.float64, np.uint8])
+def test_truth_of_a_histogram_has_one_type(kind):
+    """Numbers are converted, and judged afterwards; what stands for truth values and is none is refused."""
+    histogram = sense(WALL, Sensor(), PhotonBudget(5, 5), seed=0)
+    given = np.full(histogram.depth_m.shape, 2, kind)
+    for name, held in (("depth_m", np.float32), ("albedo", np.float16), ("expected_signal", np.float32)):
+        found = getattr(replace(histogram, **{name: given}), name)
+        assert found.dtype == held and (found == 2).all() and not found.flags.writeable
+    assert given.flags.writeable
+    with pytest.raises(InputError, match=rf"^histogram: mixed is {np.dtype(kind)}, expected bool$"):
+        replace(histogram, mixed=given // 2)
+    for bad in (given.astype(float) - 3, given.astype(int) - 3, given.astype(float) * 1e300):
+        with pytest.raises(InputError, match=r"^histogram: depth_m holds infinite or negative values$"):
+            replace(histogram, depth_m=bad)
+    with pytest.raises(InputError, match=r"^histogram: depth_m is complex128, expected float32$"):
+        replace(histogram, depth_m=given.astype(complex))
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
