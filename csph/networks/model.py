@@ -204,10 +204,12 @@ class DepthModel(nn.Module):
     def check_histogram(self, histogram: Histogram) -> None:
         """Raise InputError unless the histogram is of the sensor that the model was trained for."""
         require_kind(histogram, Histogram, "DepthModel", " of `sense`, `read_histogram` or `read_mat`")
-        mine, other = self.config.sensor, histogram.sensor
-        alike = (mine.bins, mine.bin_width_s, mine.response) == (other.bins, other.bin_width_s, other.response)
-        message = ", ".join(f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in (mine, other))
-        require(alike, f"the network was trained for another sensor or pulse than the histogram's: {message}")
+        sensors = self.config.sensor, histogram.sensor
+        mine, other = ((s.bins, s.bins_per_period, s.bin_width_s, s.response) for s in sensors)
+        message = ", ".join(
+            f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps, period of {s.bins_per_period})" for s in sensors
+        )
+        require(mine == other, f"the network was trained for another sensor or pulse than the histogram's: {message}")
 
     def _tiles(self, rows: int, columns: int, tile: int | None) -> Iterator[tuple[Span, Span]]:
         _, height, width = self.config.block

@@ -3,6 +3,7 @@
 import json
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from csph.training.loop import train
 from csph.training.views import Views, read_views
 from scene2spad.datasets.planes import random_planes
 from scenes import InputError
+from spad.measurements.histogram import Histogram
 
 DESIGN = Design("learned", (64, 2, 2), 8)
 MODEL = ModelConfig(design=DESIGN)
@@ -157,6 +159,15 @@ def test_what_is_no_path_and_no_histogram_is_refused_in_one_line():
     for refused in (DepthModel(MODEL).estimate, DepthModel(MODEL).check_histogram):
         with pytest.raises(InputError, match=r"^DepthModel: expected a Histogram of `sense`.*, not ndarray$"):
             refused(COUNTS)
+
+
+def test_a_network_takes_histograms_of_its_sensors_period_alone():
+    """With as many bins of the same width, of which the period has twice as many: a circle of bins is none there."""
+    sensor = MODEL.sensor
+    own, gated = (Histogram.from_counts(COUNTS[0, 0].T, one) for one in (sensor, replace(sensor, period_s=2e-7)))
+    DepthModel(MODEL).check_histogram(own)
+    with pytest.raises(InputError, match=r"another sensor or pulse .* period of 1024\), .* period of 2048\)"):
+        DepthModel(MODEL).check_histogram(gated)
 
 
 @pytest.mark.parametrize("init", ["none-mixed-s0", WeightsOf("none-mixed-s0")])
