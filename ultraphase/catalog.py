@@ -18,7 +18,7 @@ FOLDER = Path(__file__).parent / "programs"
 SPATIAL_BLOCK = (2, 2)
 TIMESTAMPS = 1024
 TIME_BLOCK = 256
-SPADS = 16  # of a core that keeps their addresses
+SPADS = 16  # that share a core of the chip, 4 x 4: `addressed` keeps their addresses
 
 
 @dataclass(frozen=True)

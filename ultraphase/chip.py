@@ -61,7 +61,6 @@ class ChipSpec:
     """
 
     cores: tuple[int, int] = (3, 6)
-    spads_per_core: tuple[int, int] = (4, 4)
     program_words: int = 256
     ram_bits: int = 4096
     clock_s: float = 2.38e-9
@@ -79,8 +78,7 @@ class ChipSpec:
         good = self.ram_bits % 16 == 0 and 16 <= self.ram_bits <= 1 << 19
         require(good, f"chip: {self.ram_bits} bits of RAM, expected a multiple of 16 from 16 to 524288")
         require(1 <= self.max_shift <= 31, f"chip: max_shift {self.max_shift}, expected 1 to 31")
-        for name in ("cores", "spads_per_core"):
-            object.__setattr__(self, name, whole_pair(getattr(self, name), f"chip: {name}"))
+        object.__setattr__(self, "cores", whole_pair(self.cores, "chip: cores"))
         clocks = self.clocks_per_instruction
         require(clocks >= 1, f"chip: {clocks} clocks an instruction, expected 1 or more")
         for name in ("clock_s", "energy_per_instruction_j", "io_voltage_v", "io_load_f"):

@@ -83,7 +83,7 @@ def test_a_core_takes_a_program_and_tables_by_name(kind):
         ("clock_s", "1", "a number"),
         ("cores", 3, "two whole numbers (rows, columns)"),
         ("cores", (3,), "two whole numbers (rows, columns)"),
-        ("spads_per_core", (4, 4.0), "a whole number"),
+        ("cores", (4, 4.0), "a whole number"),
     ],
 )
 def test_fields_of_a_chip_are_of_their_kind(field, value, expected):
