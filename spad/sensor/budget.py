@@ -81,7 +81,10 @@ class Optics:
 
     @property
     def pixel_sr(self) -> float:
-        """Compute the solid angle that a pixel on the axis sees [sr], (pitch / focal length)^2."""
+        """Compute the solid angle that a pixel on the axis sees [sr], (pitch / focal length)^2.
+
+        Every pixel gets it, and the whole aperture: the cos^4 by which a real lens dims the others is left out.
+        """
         return (self.pixel_pitch_m / self.focal_length_m) ** 2
 
     @property
