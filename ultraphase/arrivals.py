@@ -25,15 +25,17 @@ from typing import TypeAlias
 import numpy as np
 
 from scenes.errors import InputError, require
+from scenes.random_streams import Stream
 from ultraphase.assembly.program import Program
-from ultraphase.chip import ChipSpec, chosen_chip
+from ultraphase.chip import ChipSpec
 from ultraphase.core import WATCHDOG_STEPS, Core
-from ultraphase.port import port_timestamps, whole_timestamps
+from ultraphase.port import port_timestamps
 
 # What the instructions up to the next branch do, how many they are, and which instruction asks the port
 _Step: TypeAlias = tuple[Callable[[], int], int, str]
 # The core at its last look at an empty port (word, registers, RAM), and when that was
 _Idle: TypeAlias = tuple[tuple[int, tuple[int, ...], bytes], int]
+_STREAM = Stream.PLAN  # arrivals share its number: it was given away twice, and results in files follow from it
 _PORT_INSTRUCTIONS = ("BNT", "RDT", "BFE")
 
 
@@ -159,36 +161,10 @@ def lost_fraction(
     return float(1 - full / (rate * (full * float(service.mean()) + (1 - full) * idle_clocks)))
 
 
-def md1_lost_fraction(rho: float) -> float:
-    """Return the same of the queue M/D/1 with one place to wait: a core that looks at its port all the time."""
-    return float(1 - 1 / (rho + np.exp(-rho)))
-
-
 def poisson_arrivals(rate: float, frame_clocks: int, seed: int) -> np.ndarray:
     """Return rising clocks of a Poisson process of `rate` photons a clock. Raises InputError for a rate below 0, NaN or
     without end, and a frame below 0."""
     require(0 <= rate < np.inf, f"arrivals: a rate of {rate:g} photons a clock, expected a finite number of 0 or more")
     require(frame_clocks >= 0, f"arrivals: a frame of {frame_clocks} clocks, expected 0 or more")
-    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(10,)))
+    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAM,)))
     return np.sort(random.random(random.poisson(rate * frame_clocks))) * frame_clocks
-
-
-def periodic_arrivals(
-    timestamps: np.ndarray, frame_clocks: int, seed: int, *, period_s: float = 100e-9, chip: ChipSpec | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return clocks of photons that a pulsed laser brings: every timestamp in a laser cycle drawn at random, at its
-    place in the period. A cycle may hold several, as with the SPADs of one core.
-
-    timestamps (N,) whole numbers over the period, 0 to 1023 of the chip's 10 bits -> clocks (N,) rising, and the
-    timestamps in that order. Raises InputError for other timestamps, and a frame that is shorter than the period.
-    """
-    chip = chosen_chip(chip, "periodic_arrivals")
-    stamps = whole_timestamps(timestamps, chip.timestamps, "arrivals: ")
-    random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(11,)))
-    period = period_s / chip.clock_s
-    fits = frame_clocks >= period
-    require(fits, f"arrivals: a frame of {frame_clocks:g} clocks is shorter than the laser period of {period:g} clocks")
-    cycles = random.integers(0, int(frame_clocks // period), len(stamps))
-    clocks = (cycles + (stamps + random.random(len(stamps))) / chip.timestamps) * period
-    order = np.argsort(clocks, kind="stable")
-    return clocks[order], stamps[order]

@@ -152,7 +152,7 @@ def estimate_depth(counts: Tensor, sensor: Sensor, method: str = "log-matched", 
 
     It is the depth where the laser is co-located with the camera. Counts know no laser: `histogram_depth_m` takes a
     `Histogram`, which does, and gives the depth beside a displaced one too. `law` is the detection law whose losses
-    `coates` undoes; None stands for that of the sensor's detector (`spad.estimators.pile_up.linearised`). Raises
+    `coates` undoes; None stands for that of the sensor's detector (`spad.estimators.pile_up.without_pile_up`). Raises
     InputError for an unknown method, a wrong number of bins, negative or non-finite counts, and with `coates` for an
     unknown law, and counts that the law cannot have made.
     """

@@ -76,7 +76,7 @@ def free_running_flux(counts: Tensor, cycles: float, sensor: Sensor) -> Tensor:
 
 def warn_of_saturation(counts: Tensor, sensor: Sensor, law: str | None = None) -> None:
     """Log a warning where a free-running detector's pixels were live for less than 5 dead times in all, counts
-    (..., T); `law` as in `linearised`.
+    (..., T); `law` as in `without_pile_up`.
 
     The flux is detections over the live time, which is the exposure less a dead time a detection. Near saturation it is
     a small difference of large numbers: the blind part at the exposure's end alone makes 10 % of it.
@@ -106,7 +106,7 @@ def _too_few(detections: Tensor, sensor: Sensor) -> Tensor:
     return detections * max(1.0, sensor.dead_time_s / sensor.period_s) <= LOW_FLUX * sensor.cycles
 
 
-def linearised(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor:
+def without_pile_up(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor:
     """Return counts as they would be without pile-up, (..., T) float64: `coates`, or `free_running_flux`, times the
     cycles.
 
@@ -116,17 +116,11 @@ def linearised(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor
 
     Pixels with at most 1 % detections per cycle (or dead time, if longer) keep their counts: what would change is a
     hundredth of one, which does nothing but decide between equal maxima. Saturated pixels are told by
-    `warn_of_saturation`.
+    `warn_of_saturation`. Raises InputError for an unknown law, and counts that it cannot have made.
 
     The law is undone as if timestamps had no jitter. What jitter moved to before the first arrival then takes from what
     follows: with a jitter of 85 ps (sigma) and a pulse of 42 ps a depth is 2 mm too large at one photon a cycle.
     """
-    warn_of_saturation(counts, sensor, law)
-    return without_pile_up(counts, sensor, law)
-
-
-def without_pile_up(counts: Tensor, sensor: Sensor, law: str | None = None) -> Tensor:
-    """Return `linearised` of some of an image's pixels, without its warning."""
     counts, law = counts.double(), _law(sensor, law)
     if law == "poisson":
         return counts

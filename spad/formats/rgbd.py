@@ -1,6 +1,6 @@
-"""RGB-D images -> expected counts: the simulation of the ICCV 2023 paper's supplement S.5.1, in two conventions.
+"""RGB-D images: the simulation of the ICCV 2023 paper's supplement S.5.1, in two conventions.
 
-`from_rgbd` goes through a transient, one return a depth sample: the pulse's centroid at 2 d / c, radiance
+`transient_from_rgbd` makes a transient, one return a depth sample: the pulse's centroid at 2 d / c, radiance
 albedo cos(theta) / (pi d^2), everything else as for a rendered scene. `published_from_rgbd` follows the paper's code:
 one return a pixel at the rounded bin, albedo / d^2 without a cosine, c = 3e8 m/s.
 """
@@ -16,8 +16,6 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError, require, require_kind, require_number, require_whole
 from scenes.json_types import JsonObject
-from spad.detection.flux import expected_counts
-from spad.detection.rates import rates_for
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
 
@@ -33,51 +31,14 @@ class Expected(NamedTuple):
     """Expected primary detections of an RGB-D image.
 
     rates        (H, W, T) float64 per exposure
-    depth_m      (H, W) float64: the label that the convention trains and tests on, NaN for none
-    range_bin    (H, W) int64: bin of the pulse's peak, from 1 as in the published files; 0 for none
+    depth_m      (H, W) float64: the label that the convention trains and tests on
     signal, background   (H, W) float64 per exposure
-    dark_fraction   part of the mean background that is dark counts
     """
 
     rates: np.ndarray
     depth_m: np.ndarray
-    range_bin: np.ndarray
     signal: np.ndarray
     background: np.ndarray
-    dark_fraction: float
-
-
-def from_rgbd(
-    depth_m: np.ndarray,
-    albedo: np.ndarray,
-    ambient: np.ndarray,
-    sensor: Sensor,
-    budget: PhotonBudget,
-    *,
-    fov_deg: float | None = None,
-    block: int = 1,
-) -> Expected:
-    """Return expected counts of an RGB-D image: radial depth [m], albedo and ambient light of any scale, (H, W) each.
-
-    Returns are as `transient_from_rgbd` says, which takes `fov_deg` and `block`; signal and background are means over
-    the image. Raises InputError for arrays of different shapes.
-    """
-    transient = transient_from_rgbd(depth_m, albedo, ambient, fov_deg=fov_deg, block=block)
-    shape = (transient.height, transient.width)
-    rates = rates_for(transient, sensor, budget)
-    counts = expected_counts(transient, sensor, rates, slice(0, transient.height * transient.width))[0].numpy()
-    background = rates.background * (sensor.bins / sensor.bins_per_period)
-    depth = transient.depth_m.astype(np.float64)
-    known = np.isfinite(depth)
-    position = np.where(known, depth, 0) / sensor.bin_depth_m
-    return Expected(
-        rates=counts.reshape(*shape, sensor.bins),
-        depth_m=depth,
-        range_bin=np.where(known, np.floor(position).astype(np.int64) % sensor.bins_per_period + 1, 0),
-        signal=np.clip(counts.sum(axis=1).reshape(shape) - background, 0, None),
-        background=background,
-        dark_fraction=rates.dark_fraction,
-    )
 
 
 def _alike(*images: np.ndarray) -> list[np.ndarray]:
@@ -221,7 +182,8 @@ def _tangent(points: np.ndarray, axis: int) -> np.ndarray:
 def published_from_rgbd(
     depth_m: np.ndarray, albedo: np.ndarray, ambient: np.ndarray, sensor: Sensor, budget: PhotonBudget
 ) -> Expected:
-    """Return expected counts of an RGB-D image as the published code computes them: arrays as for `from_rgbd`.
+    """Return expected counts of an RGB-D image as the published code computes them: radial depth [m],
+    albedo and ambient light of any scale, (H, W) each.
 
     beta = round(2 d / (c Delta)) modulo T, 1 or more; S = signal a / d^2 over its mean; A = dark counts + background b
     over its mean, rescaled to the asked mean; rate = S h + A / T with the largest sample of the published taps h at bin
@@ -249,8 +211,7 @@ def published_from_rgbd(
     for tap, fraction in enumerate(taps):  # no two taps in one bin, as there are fewer than bins
         rates[rows, columns, (beta - 1 + tap - peak) % bins] += signal * fraction
     label = (beta - 1) * (speed * sensor.bin_width_s / 2)
-    dark_fraction = float(dark.mean() / both.mean()) if both.any() else 0.0
-    return Expected(rates, label, beta, signal, both * scale, dark_fraction)
+    return Expected(rates, label, signal, both * scale)
 
 
 def published_taps(sensor: Sensor) -> np.ndarray:

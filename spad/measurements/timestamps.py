@@ -41,11 +41,6 @@ class Timestamps:
         if len(self.stamps) and int(self.stamps.max()) >= self.bins:
             raise InputError(f"timestamp {self.stamps.max()} is outside the {self.bins} bins")
 
-    @property
-    def bits(self) -> int:
-        """Return the number of bits of one timestamp."""
-        return max(1, (self.bins - 1).bit_length())
-
     def counts(self) -> np.ndarray:
         """Return the dense form, (H, W, T) int32."""
         return counts_from_timestamps(self.stamps, self.offsets, self.bins).reshape(self.height, self.width, self.bins)
@@ -56,20 +51,6 @@ class Timestamps:
         height, width, bins = counts.shape
         stamps, offsets = timestamps_from_counts(counts)
         return cls(height, width, bins, stamps, offsets, meta or {})
-
-    def packed(self) -> np.ndarray:
-        """Return all stamps as one stream of `bits` bits each, most significant first, (ceil(N bits / 8),) uint8."""
-        shifts = np.arange(self.bits - 1, -1, -1, dtype=np.uint16)
-        return np.packbits(((self.stamps[:, None] >> shifts) & 1).astype(np.uint8))
-
-    def unpacked(self, stream: np.ndarray) -> Timestamps:
-        """Return these offsets with the stamps of a stream that `packed` made; InputError if it is too short."""
-        count = int(self.offsets[-1])
-        if len(stream) * 8 < count * self.bits:
-            raise InputError(f"{len(stream)} bytes hold fewer than {count} stamps of {self.bits} bits")
-        digits = np.unpackbits(stream, count=count * self.bits).reshape(count, self.bits)
-        stamps = digits @ (1 << np.arange(self.bits - 1, -1, -1, dtype=np.int64))
-        return Timestamps(self.height, self.width, self.bins, stamps.astype(np.uint16), self.offsets, self.meta)
 
 
 def checked_events(stamps: np.ndarray, offsets: np.ndarray, pixels: int, bins: int) -> tuple[np.ndarray, np.ndarray]:

@@ -222,11 +222,6 @@ class Sensor:
         """Return the depth [m] that one bin spans, c bin_width / 2."""
         return SPEED_OF_LIGHT_M_PER_S * self.bin_width_s / 2
 
-    @property
-    def timestamp_bits(self) -> int:
-        """Return the number of bits of one timestamp: 10 for 1024 bins."""
-        return max(1, (self.bins - 1).bit_length())
-
     def dark_rate_map_hz(self, height: int, width: int, seed: int = 0) -> np.ndarray:
         """Return dark counts per second of every pixel, (H, W) float64: rows, then hot pixels at random by the seed."""
         rows = np.resize(np.asarray(self._dark_rows, dtype=np.float64), height)

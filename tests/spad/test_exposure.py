@@ -27,11 +27,9 @@ def test_timestamps_and_histogram_are_one_draw(model: str, signal: float, crosst
     scene, budget = same(1500 if signal < 100 else 20, (4.0, 4.1, 1.0)), PhotonBudget(signal, 20)
     stamps = sense_timestamps(scene, sensor, budget, seed=2, model=model)
     counts = sense(scene, sensor, budget, seed=2, model=model).counts
-    assert (stamps.counts() == counts).all() and stamps.bits == 10 == sensor.timestamp_bits
+    assert (stamps.counts() == counts).all()
     again = Timestamps.of_counts(counts)
     assert (again.stamps == stamps.stamps).all() and (again.offsets == stamps.offsets).all()
-    assert (stamps.unpacked(stamps.packed()).stamps == stamps.stamps).all()
-    assert len(stamps.packed()) == -(-len(stamps.stamps) * 10 // 8)
 
 
 def test_pieces_of_an_exposure_are_the_exposure_and_report_progress(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from spad.detection.laws import (
     first_photon_masses,
     live_detections,
 )
-from spad.estimators.pile_up import coates, free_running_flux, linearised
+from spad.estimators.pile_up import coates, free_running_flux, without_pile_up
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 
 REFERENCE = Sensor()
@@ -157,7 +157,7 @@ def test_few_detections_are_left_as_they_are() -> None:
     counts[0, [3, 50]] = 1
     counts[1] = 10
     sensor = replace(SMALL, exposure_s=1000 * SMALL.period_s)
-    kept = linearised(counts, sensor)
+    kept = without_pile_up(counts, sensor)
     assert torch.equal(kept[0], counts[0].double())
     assert torch.allclose(kept[1], coates(counts[1], 1000) * 1000) and kept[1, 60] > 20
 

@@ -10,7 +10,7 @@ from test_laws import same
 from scenes.errors import InputError
 from spad.detection.detect import choose_model, sense
 from spad.estimators.depth import confidence, confidence_map, detection_law, estimate_depth, histogram_depth_m
-from spad.estimators.pile_up import coates, free_running_flux, linearised
+from spad.estimators.pile_up import coates, free_running_flux, warn_of_saturation, without_pile_up
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 
@@ -24,7 +24,7 @@ BUDGET = PhotonBudget(1.5 * CYCLES, 2.0 * CYCLES)
 def recovered(histogram: Histogram, law: str | None = None) -> float:
     """Primary detections a pixel and cycle, after pile-up is undone."""
     counts = torch.from_numpy(histogram.counts)
-    return float(linearised(counts, histogram.sensor, law).sum()) / (CYCLES * PIXELS)
+    return float(without_pile_up(counts, histogram.sensor, law).sum()) / (CYCLES * PIXELS)
 
 
 @pytest.mark.parametrize("dead_s", [150e-9, 250e-9])
@@ -39,7 +39,7 @@ def test_a_synchronous_detector_that_misses_cycles_is_not_corrected_as_one_that_
     counts = torch.from_numpy(histogram.counts)
     assert float(coates(counts, CYCLES).sum()) / PIXELS < PER_CYCLE / 3, "the other law's inverse is far off"
     free = replace(sensor, reset="free-running")
-    assert torch.equal(linearised(counts, sensor), linearised(counts, free))
+    assert torch.equal(without_pile_up(counts, sensor), without_pile_up(counts, free))
     # one pixel is off by 1.3 mm (standard deviation), the mean of 200 by 0.1 mm
     error_m = estimate_depth(counts, sensor, "coates").numpy() - WALL_M
     assert abs(error_m.mean()) < 1e-3 < 5e-3 < abs(estimate_depth(counts, sensor).numpy() - WALL_M).mean()
@@ -71,9 +71,9 @@ def test_without_a_stated_law_it_is_the_detectors() -> None:
     assert detection_law(Histogram.from_counts(counts, sensor, {"model": "zones"})) is None
     assert detection_law(sense(WALL, SENSOR, PhotonBudget(5, 5))) is None
     rows = torch.from_numpy(counts)
-    assert torch.equal(linearised(rows, sensor), coates(rows, 100) * 100)
+    assert torch.equal(without_pile_up(rows, sensor), coates(rows, 100) * 100)
     free = replace(sensor, reset="free-running", dead_time_s=2e-9)
-    assert torch.equal(linearised(rows, free), free_running_flux(rows, 100, free) * 100)
+    assert torch.equal(without_pile_up(rows, free), free_running_flux(rows, 100, free) * 100)
 
 
 def test_an_unknown_law_or_method_is_refused() -> None:
@@ -83,7 +83,7 @@ def test_an_unknown_law_or_method_is_refused() -> None:
     depth_m = estimate_depth(counts, sensor, "coates", law="first-photon")
     known = "poisson, first-photon, free-running"
     for refused in (
-        lambda: linearised(counts, sensor, "first_photon"),
+        lambda: without_pile_up(counts, sensor, "first_photon"),
         lambda: estimate_depth(counts, sensor, "coates", law=""),
         lambda: confidence(counts, depth_m, sensor, "coates", law="first_photon"),
     ):
@@ -109,7 +109,7 @@ def test_a_saturated_free_running_detector_is_told_of_in_one_line(caplog) -> Non
     for detections, lines in ((1800, 0), (1998, 1)):
         caplog.clear()
         counts = torch.full((2, 3, sensor.bins), detections / sensor.bins)
-        linearised(counts, sensor)
+        warn_of_saturation(counts, sensor)
         assert len(caplog.messages) == lines
         estimate_depth(counts, sensor, "coates")
         assert len(caplog.messages) == 2 * lines
@@ -122,7 +122,7 @@ def test_the_law_that_is_chosen_and_the_inverse_agree(reset: str, dead_s: float)
     sensor = replace(SENSOR, reset=reset, dead_time_s=dead_s)
     chosen, _ = choose_model("auto", PER_CYCLE, sensor)
     counts = torch.from_numpy(sense(WALL, sensor, PhotonBudget(1000, 1000), seed=4).counts[:, :4])
-    assert torch.equal(linearised(counts, sensor), linearised(counts, sensor, chosen))
+    assert torch.equal(without_pile_up(counts, sensor), without_pile_up(counts, sensor, chosen))
 
 
 def test_a_dead_time_without_effect_is_told_in_the_plan() -> None:

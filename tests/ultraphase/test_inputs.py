@@ -7,7 +7,7 @@ import pytest
 
 from scenes.errors import InputError
 from ultraphase import ChipSpec, Core, CoreArray, assemble, assemble_file, method, verify
-from ultraphase.arrivals import TimedCore, periodic_arrivals
+from ultraphase.arrivals import TimedCore
 from ultraphase.power import Cost, Load, power
 
 COARSE = method("coarse-16").program()
@@ -39,13 +39,6 @@ def test_every_way_into_a_core_checks_its_timestamps(stamps, message):
     )
     for way in ways:
         assert message in refused(way)
-    assert message.split(" is outside")[0] in refused(lambda: periodic_arrivals(stamps, 100_000, seed=0))
-
-
-def test_timestamps_of_a_pulsed_laser_are_those_of_the_chip():
-    assert "timestamp 256 is outside 0 to 255" in refused(
-        lambda: periodic_arrivals(np.array([256]), 100_000, seed=0, chip=ChipSpec(timestamp_bits=8))
-    )
 
 
 def test_offsets_that_are_not_whole_are_refused():
