@@ -13,9 +13,8 @@ from csph.autograd import Context
 from csph.networks.published import soft_argmax
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.sensor.model import Sensor
+from spad.sensor.pulse import REACH_SIGMAS
 from spad.sensor.template import wrapped_mass
-
-_REACH_SIGMAS = 8.5  # of the pulse, either side of its arrival
 
 
 class Target(NamedTuple):
@@ -30,7 +29,7 @@ def pulse_target(depth_m: Tensor, sensor: Sensor) -> Target:
     left out, and the rest scaled to a unit sum. Depths (...,) must be finite."""
     position = depth_m.double() * (2 / (SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s))
     first = position.floor()
-    before, after = sensor.response.window_s(_REACH_SIGMAS)
+    before, after = sensor.response.window_s(REACH_SIGMAS)
     low = -math.ceil(abs(before) / sensor.bin_width_s) - 1
     high = math.ceil(abs(after) / sensor.bin_width_s) + 1
     count = high - low + 1

@@ -15,9 +15,8 @@ import numpy as np
 
 from spad.detection.laws import Detections
 from spad.sensor.model import Sensor
-from spad.sensor.pulse import AnyPulse, convolved
+from spad.sensor.pulse import REACH_SIGMAS, AnyPulse, convolved
 
-WINDOW_SIGMAS = 8.5
 STEPS_PER_STD = 4  # of the pulse
 MAX_STEPS = 16  # per bin
 MAX_BINS, FINEST_S = 65536, 1e-15  # of a sensor
@@ -82,7 +81,7 @@ def _folded(jitter: AnyPulse, sensor: Sensor) -> np.ndarray:
     """Return fractions of detections that jitter moves by 0, 1, ... steps around the period, (T,)."""
     steps = steps_per_bin(sensor)
     period, width = sensor.bins_per_period * steps, sensor.bin_width_s / steps
-    before, after = jitter.window_s(WINDOW_SIGMAS)
+    before, after = jitter.window_s(REACH_SIGMAS)
     moves = np.arange(-int(np.ceil(abs(before) / width)) - 1, int(np.ceil(abs(after) / width)) + 2)
     edges = np.append(moves, moves[-1] + 1)
     fractions = sum(

@@ -18,10 +18,7 @@ import torch
 from torch import Tensor
 
 from spad.sensor.model import Sensor
-from spad.sensor.pulse import AnyPulse, Pulse, SampledPulse, pulse_table
-
-# Half the window outside which float64 sees nothing of a Gaussian: 1 - erf(8.5 / sqrt 2) = 1.9e-17.
-_REACH_SIGMAS = 8.5
+from spad.sensor.pulse import REACH_SIGMAS, AnyPulse, Pulse, SampledPulse, pulse_table
 
 FINE_STEP = 1 / 8  # bins between the arrivals of an estimator's fine grid; a parabola does the rest
 FINEST_STEP = FINE_STEP / 8  # the same around the best of these, where the pulse is too narrow for a parabola there
@@ -129,7 +126,7 @@ def pulse_mass_slope(pulse: AnyPulse, centre: Tensor, width_s: float) -> Tensor:
 
 def wraps(sensor: Sensor) -> range:
     """Return the periods m for which a pulse m periods away still reaches a bin within half a period of its arrival."""
-    reach = (max(sensor.response.window_s(_REACH_SIGMAS)) + sensor.bin_width_s) / sensor.period_s
+    reach = (max(sensor.response.window_s(REACH_SIGMAS)) + sensor.bin_width_s) / sensor.period_s
     count = max(0, math.ceil(reach - 0.5))
     return range(-count, count + 1)
 

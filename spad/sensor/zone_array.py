@@ -36,7 +36,7 @@ EFFECTS = (
     "background",
 )
 # What a switch is where it is off, of those that have a number for each zone.
-_OFF = {
+OFF = {
     "gain": 1.0,
     "delay_s": 0.0,
     "skew_s": 0.0,
@@ -105,11 +105,11 @@ class ZoneArray:
         require(1 <= count <= 4096, f"zones: {count} of them, expected 1 to 4096")
         for spec in fields(self):
             name, values = spec.name, getattr(self, spec.name)
-            many = name in (*VIEW, *_OFF)
+            many = name in (*VIEW, *OFF)
             if many and isinstance(values, Real):
                 values = (values,) * count
-            elif name in _OFF and isinstance(values, tuple | list) and not values:
-                values = (_OFF[name],) * count
+            elif name in OFF and isinstance(values, tuple | list) and not values:
+                values = (OFF[name],) * count
             if many or name == "baseline_m":
                 values = numbers_of(name, values)
                 expected = count if many else 3
@@ -140,14 +140,14 @@ class ZoneArray:
             "clock": {"clock": (float(np.mean(self.clock)),) * even},
             "chirp": {"chirp_hz": 0.0},
             "delay": {"delay_s": (float(np.mean(self.delay_s)),) * even},
-            "skew": {"skew_s": (0.0,) * even},
-            "leak": {"leak": (0.0,) * even},
-            "echo": {"echo_m2": (0.0,) * even},
+            "skew": {"skew_s": (OFF["skew_s"],) * even},
+            "leak": {"leak": (OFF["leak"],) * even},
+            "echo": {"echo_m2": (OFF["echo_m2"],) * even},
             "crosstalk": {"crosstalk": 0.0},
-            "saturation": {"trials": (math.inf,) * even},
-            "recovery": {"recovery": (0.0,) * even},
-            "compression": {"compression": (0.0,) * even},
-            "background": {"background": (0.0,) * even},
+            "saturation": {"trials": (OFF["trials"],) * even},
+            "recovery": {"recovery": (OFF["recovery"],) * even},
+            "compression": {"compression": (OFF["compression"],) * even},
+            "background": {"background": (OFF["background"],) * even},
         }
         require(effect in off, f"effect {effect!r} is unknown, expected one of {', '.join(EFFECTS)}")
         return replace(self, **off[effect])

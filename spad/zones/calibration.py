@@ -11,10 +11,10 @@ import numpy as np
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import did_you_mean, require
-from spad.sensor.files import SensorFile
+from spad.sensor.files import ZONES, SensorFile
 from spad.sensor.model import Sensor
 from spad.sensor.pulse import SampledPulse
-from spad.sensor.zone_array import ZoneArray
+from spad.sensor.zone_array import OFF, ZoneArray
 from spad.zones.expected_counts import FINE, PulseBasis, Values, ZoneCapture, ZoneModel
 from spad.zones.fit import covariance_of, fit
 
@@ -33,19 +33,8 @@ OPTIONAL = (
     "compression",
     "crosstalk",
 )
-_OFF = {
-    "background": 0.0,
-    "recovery": 0.0,
-    "compression": 0.0,
-    "crosstalk": 0.0,
-    "clock": 1.0,
-    "chirp": 0.0,
-    "trials": math.inf,
-    "delay": 0.0,
-    "skew": 0.0,
-    "leak": 0.0,
-    "echo": 0.0,
-}
+# What the fit has where they are off; chirp and crosstalk are one number for all zones.
+_OFF = {name: OFF.get(ZONES[name].field, 0.0) for name in OPTIONAL if name != "bin_width"}
 MIN_FITTED = 8  # captures
 TAIL_BINS = 48
 RISE_BINS, RISE_BINS_LIMIT = 2, 8
