@@ -206,10 +206,8 @@ class DepthModel(nn.Module):
         require_kind(histogram, Histogram, "DepthModel", " of `sense`, `read_histogram` or `read_mat`")
         sensors = self.config.sensor, histogram.sensor
         mine, other = ((s.bins, s.bins_per_period, s.bin_width_s, s.response) for s in sensors)
-        message = ", ".join(
-            f"{s.name} ({s.bins} bins of {s.bin_width_s * 1e12:.4g} ps, period of {s.bins_per_period})" for s in sensors
-        )
-        require(mine == other, f"the network was trained for another sensor or pulse than the histogram's: {message}")
+        words = (f"{s.name} ({s.bins} of {s.bins_per_period} bins of {s.bin_width_s * 1e12:.4g} ps)" for s in sensors)
+        require(mine == other, f"the network was trained for another sensor or pulse: {', not for '.join(words)}")
 
     def _tiles(self, rows: int, columns: int, tile: int | None) -> Iterator[tuple[Span, Span]]:
         _, height, width = self.config.block
