@@ -110,7 +110,7 @@ class FirstPhoton(DetectionLaw):
     def detect(self, light: BlockLight, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detections]:
         """Yield the first of the primary detections of each cycle."""
         events = light.drawn(rng)
-        events = events._replace(cycle=rng.integers(round(light.sensor.cycles), size=len(events.pixel)))
+        events = events._replace(cycle=rng.integers(light.sensor.whole_cycles, size=len(events.pixel)))
         yield first_of_each_cycle(events, light.sensor)
 
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
@@ -119,7 +119,7 @@ class FirstPhoton(DetectionLaw):
 
     def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
         """Return the number of cycles that hold a photon."""
-        return -sensor.cycles * np.expm1(-primaries / sensor.cycles)
+        return -sensor.whole_cycles * np.expm1(-primaries / sensor.whole_cycles)
 
     def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator, moved: Moved | None = None) -> np.ndarray:
         """Draw the multinomial of all cycles (`first_photon_counts`)."""
@@ -133,11 +133,11 @@ class FreeRunning(DetectionLaw):
 
     def pieces(self, light: BlockLight) -> int:
         """Return into how many stretches of cycles an exposure is cut, so that MAX_EVENTS are held at once."""
-        return min(max(1, math.ceil(light.primaries / MAX_EVENTS)), round(light.sensor.cycles))
+        return min(max(1, math.ceil(light.primaries / MAX_EVENTS)), light.sensor.whole_cycles)
 
     def detect(self, light: BlockLight, rng: np.random.Generator, ready: np.ndarray) -> Iterator[Detections]:
         """Yield the detections of as many cycles at a time as memory allows."""
-        sensor, cycles, pieces = light.sensor, round(light.sensor.cycles), self.pieces(light)
+        sensor, cycles, pieces = light.sensor, light.sensor.whole_cycles, self.pieces(light)
         edges = [cycles * piece // pieces for piece in range(pieces + 1)]
         for start, stop in pairwise(edges):
             fraction = (stop - start) / cycles

@@ -261,7 +261,7 @@ def draw_part(
         sensor = over_the_period(exposure.sensor) if exposure.delays_detected else exposure.sensor
         rate = expected_counts(exposure.transient, sensor, exposure.rates, block)[0].numpy()
         meter.add(light.flux.pixels)
-        return law.counts(rate, round(sensor.cycles), rng, exposure.moved(block))
+        return law.counts(rate, sensor.whole_cycles, rng, exposure.moved(block))
     parts = meter.count(law.detect(light, rng, ready), law.pieces(light), light.flux.pixels)
     return np.concatenate([_places(exposure.finished(part, block.start, rng), exposure.sensor) for part in parts])
 

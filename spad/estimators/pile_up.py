@@ -125,7 +125,7 @@ def without_pile_up(counts: Tensor, sensor: Sensor, law: str | None = None) -> T
     if law == "poisson":
         return counts
     if law == "first-photon":
-        corrected = coates(counts, sensor.cycles) * sensor.cycles
+        corrected = coates(counts, sensor.whole_cycles) * sensor.whole_cycles
     else:
-        corrected = free_running_flux(counts, sensor.cycles, sensor) * sensor.cycles
+        corrected = free_running_flux(counts, sensor.whole_cycles, sensor) * sensor.whole_cycles
     return torch.where(_too_few(counts.sum(-1, keepdim=True), sensor), counts, corrected)

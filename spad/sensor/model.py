@@ -188,8 +188,13 @@ class Sensor:
 
     @property
     def cycles(self) -> float:
-        """Return the number of laser cycles in one exposure, not rounded; `sense` draws the nearest whole number."""
+        """Return the number of laser cycles in one exposure, not rounded; `sense` draws `whole_cycles`."""
         return self.exposure_s / self.period_s
+
+    @property
+    def whole_cycles(self) -> int:
+        """Return the nearest whole number of laser cycles in one exposure, which holds all of its photons."""
+        return max(1, round(self.cycles))
 
     @property
     def armed_every_cycle(self) -> bool:

@@ -9,10 +9,12 @@ from test_laws import same
 
 from scenes.errors import InputError
 from spad.detection.detect import choose_model, sense
+from spad.detection.laws import first_photon_masses
 from spad.estimators.depth import confidence, confidence_map, detection_law, estimate_depth, histogram_depth_m
 from spad.estimators.pile_up import coates, free_running_flux, warn_of_saturation, without_pile_up
 from spad.measurements.histogram import Histogram
-from spad.sensor.model import PhotonBudget, Sensor
+from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.template import binned_pulse
 
 CYCLES, PIXELS, PER_CYCLE = 2000, 200, 3.5
 SENSOR = Sensor(exposure_s=CYCLES * Sensor().period_s)
@@ -61,6 +63,15 @@ def test_a_law_that_was_asked_for_is_undone_by_its_own_inverse(sensor: Sensor, l
     tolerance = 4.5 / np.sqrt(histogram.counts.sum()) + 0.02
     assert recovered(histogram, law) == pytest.approx(PER_CYCLE, rel=tolerance)
     assert abs((histogram_depth_m(histogram, "coates") - WALL_M).mean()) < 1e-3
+
+
+@pytest.mark.parametrize("cycles", [10.4, 99.6, 1000.4])
+def test_pile_up_of_a_broken_number_of_cycles_is_that_of_the_whole_ones_drawn(cycles: float) -> None:
+    sensor = Sensor(bins=64, bin_width_s=1e-10, exposure_s=cycles * 6.4e-9, pulse=Pulse(130e-12))
+    flux = binned_pulse(torch.tensor([2e-9], dtype=torch.float64), sensor) + 0.5 / 64  # photons a cycle and bin
+    detected = sensor.whole_cycles * torch.from_numpy(first_photon_masses(flux.numpy())[:, :-1])
+    restored = without_pile_up(detected, sensor, "first-photon")
+    torch.testing.assert_close(restored, sensor.whole_cycles * flux, rtol=1e-9, atol=0)
 
 
 def test_without_a_stated_law_it_is_the_detectors() -> None:
