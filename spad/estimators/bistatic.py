@@ -21,6 +21,7 @@ from spad.sensor.clock import chirped, unchirped
 from spad.sensor.model import Sensor
 
 CO_LOCATED = (0.0, 0.0, 0.0)
+ROUNDING = 1e-6  # of a period: what float32 depths and sums of times leave
 
 
 def radial_depth_m(half_path_m: np.ndarray, directions: np.ndarray, baseline_m: Iterable[float]) -> np.ndarray:
@@ -143,12 +144,25 @@ def _converters_differ(histogram: Histogram) -> bool:
 
 
 def _light_time_s(recorded_s: np.ndarray, zones: JsonObject, sensor: Sensor) -> np.ndarray:
-    """Return when the light arrived that zones recorded at these times, (H, W) [s], within the laser's period; 0 where
-    that is before the emission by no more than the pulse's reach, as noise is."""
+    """Return when the light arrived that zones recorded at these times, (H, W) [s], within the laser's period.
+
+    Where the bins cover the period, time is circular. Else a time after the last that the zone's bins record, and
+    before the emission by no more than the pulse's reach, is 0: noise of light that arrived with the emission.
+    """
     clock, delay_s, chirp_hz = _converters(zones)
-    since_s = (recorded_s - delay_s) % sensor.period_s
-    since_s = np.where(since_s > sensor.period_s - sensor.response.reach_s, 0.0, since_s)
+    since_s = _since_emission_s(recorded_s, delay_s, sensor.period_s)
+    if sensor.bins < sensor.bins_per_period:
+        last_s = _since_emission_s(sensor.bins * sensor.bin_width_s, delay_s, sensor.period_s)
+        last_s = np.maximum(last_s + ROUNDING * sensor.period_s, sensor.period_s - sensor.response.reach_s)
+        since_s = np.where(since_s > last_s, 0.0, since_s)
     return clock * unchirped(since_s, chirp_hz)
+
+
+def _since_emission_s(recorded_s: np.ndarray | float, delay_s: np.ndarray, period_s: float) -> np.ndarray:
+    """Return recorded times less their delays, within the period, over whose ends rounding carries none."""
+    late_s = recorded_s - delay_s
+    within = np.abs(late_s - period_s / 2) <= (0.5 + ROUNDING) * period_s
+    return np.where(within, late_s.clip(0, period_s), late_s % period_s)
 
 
 def _converters(zones: JsonObject) -> tuple[np.ndarray, np.ndarray, float]:

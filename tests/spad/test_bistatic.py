@@ -13,6 +13,7 @@ from scenes.model import Camera
 from spad.estimators.bistatic import (
     optical_path_m,
     radial_depth_m,
+    radial_depth_of,
     recorded_range_m,
     time_tells_depth,
     true_arrival_s,
@@ -141,6 +142,35 @@ def test_beyond_range_counts_the_zones_whose_return_a_delay_moves_out_of_the_rec
     held = (time_s + delay_s) % gated.period_s < gated.bins * gated.bin_width_s
     errors = histogram_errors(histogram.depth_m, histogram)
     assert (errors["pixels"], errors["beyond_range"]) == (held.sum(), (~held).sum())
+
+
+@pytest.mark.parametrize("period_bins", [64, 70, 75, 200])
+def test_a_delay_of_nearly_nothing_moves_no_depth_and_no_range(period_bins):
+    """The pulse reaches 2.1 ns. Behind the record the period goes on for 0, 0.6, 1.1 and 13.6 ns."""
+    sensor = replace(GATED, period_s=period_bins * GATED.bin_width_s, pulse=Pulse(3e-10))
+    depth = np.linspace(0, sensor.recorded_range_m, 501)[None].astype(np.float32)
+    for delay_s in (1e-15, -1e-15):
+        zones = {"clock": np.ones((1, 501)), "delay_s": np.full((1, 501), delay_s), "chirp_hz": 0.0}
+        histogram = replace(histogram_of(np.full((1, 501), 0.5), sensor), meta={"zones": zones})
+        assert radial_depth_of(histogram, depth) == pytest.approx(depth, abs=1e-5)
+        assert recorded_range_m(histogram) == pytest.approx(sensor.recorded_range_m, abs=1e-5)
+
+
+@pytest.mark.parametrize("period_bins", [70, 200])
+def test_noise_just_before_the_emission_is_depth_0_where_no_bin_records_so_late(period_bins):
+    """A delay of 0.5 ns in a record of 6.4 ns: its first 0.5 ns are before the emission, its end is not."""
+    sensor = replace(GATED, period_s=period_bins * GATED.bin_width_s, pulse=Pulse(3e-10))
+    recorded_s = np.array([[0.0, 3e-10, 7e-10, 6.4e-9]])
+    zones = {"clock": np.ones((1, 4)), "delay_s": np.full((1, 4), 5e-10), "chirp_hz": 0.0}
+    histogram = replace(histogram_of(np.ones((1, 4)), sensor), meta={"zones": zones})
+    found_s = radial_depth_of(histogram, recorded_s * C / 2) * 2 / C
+    assert found_s[0] == pytest.approx([0, 0, 2e-10, 5.9e-9])
+
+
+def test_zones_find_the_last_part_of_a_range_that_their_bins_cover():
+    """A plane at 3.6 of 3.84 m: its return lies within the pulse's reach of the period's end."""
+    histogram = sense_zones(plane(3.6), ZONED, replace(NARROW, gain=(1e10, 1e10), delay_s=(1e-15, 5e-10)), seed=1)
+    assert histogram.depth_m.max() < 3.84 and histogram_errors(histogram_depth_m(histogram), histogram)["mae_mm"] < 10
 
 
 def test_clocks_run_back_as_they_ran():
