@@ -42,7 +42,8 @@ def draw_saturated(
     """Draw counts (Z, T) int64 of one exposure: Poisson without saturation, with it the multinomial of all trials,
     which is Poisson again above MANY_TRIALS.
 
-    What the compression takes is thinned from the bins.
+    Of trials that are no whole number, as a fit gives them, the last takes place with the probability of its fraction:
+    the mean is that of `saturated`. What the compression takes is thinned from the bins.
     """
     counts = np.empty(flux.shape, dtype=np.int64)
     expected = saturated(flux, trials, recovery)
@@ -50,7 +51,7 @@ def draw_saturated(
         if trials[zone] > MANY_TRIALS:  # also where they are infinite: nothing is lost
             counts[zone] = rng.poisson(mean)
             continue
-        cycles = max(1, round(trials[zone]))
+        cycles = int(trials[zone]) + rng.binomial(1, trials[zone] % 1)
         masses = mean / trials[zone]
         counts[zone] = rng.multinomial(cycles, np.append(masses, max(0.0, 1 - masses.sum())))[:-1]
     if not np.any(compression):
