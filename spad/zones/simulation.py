@@ -106,11 +106,18 @@ def _ramp(at: np.ndarray, blur: np.ndarray) -> np.ndarray:
 def since_emission(returns: ZoneReturns, period_m: float) -> ZoneReturns:
     """Return light by its path since the last emission, `period_m` the path in one period of the laser.
 
-    A converter starts anew at each emission: its clock and its chirp act on the time since the last one.
+    A converter starts anew at each emission: its clock and its chirp act on the time since the last one. An interval
+    that holds an emission is cut there, its light in proportion to the lengths.
     """
     near_m, far_m, light = returns
-    before_m = np.floor(near_m / period_m) * period_m
-    return ZoneReturns(near_m - before_m, far_m - before_m, light)
+    first = np.floor(near_m / period_m)
+    periods = np.maximum(np.ceil(far_m / period_m) - first, 1).astype(np.int64)
+    near, far, before = (np.repeat(value, periods) for value in (near_m, far_m, first))
+    before += np.arange(len(before)) - np.repeat(np.cumsum(periods) - periods, periods)
+    start = np.maximum(near - before * period_m, 0.0)
+    end = np.maximum(np.minimum(far - before * period_m, period_m), start)
+    fraction = np.divide(end - start, far - near, out=np.ones_like(far), where=far > near)
+    return ZoneReturns(start, end, np.repeat(light, periods) * fraction)
 
 
 def with_skew(returns: ZoneReturns, skew_m: float) -> ZoneReturns:

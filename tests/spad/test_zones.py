@@ -174,6 +174,18 @@ def test_light_later_than_the_period_wraps_at_it(period_bins):
         assert signal(0.4 + turns * period_m) == pytest.approx(signal(0.4), abs=1e-9)
 
 
+@pytest.mark.parametrize("converter", [{"clock": (1.01,)}, {"chirp_hz": 1e6}, {"clock": (0.9,), "skew_s": (3e-10,)}])
+def test_a_return_across_emissions_is_the_sum_of_its_pieces(converter):
+    """A converter starts anew at each emission, also within an interval, which here holds two of them."""
+    zone, period_m = ZoneArray((0.0,), (0.0,), (0.3,), (0.3,), **converter), 299792458 * SENSOR.period_s
+    ends = np.array([0.9, 1.0, 2.0, 2.2]) * period_m
+    whole = ZoneReturns(ends[:1], ends[-1:], np.array([1.3]))
+    pieces = ZoneReturns(ends[:-1], ends[1:], np.diff(ends) / period_m)
+    cut = zone_signal([pieces], SENSOR, zone)
+    assert zone_signal([whole], SENSOR, zone) == pytest.approx(cut, abs=1e-9)
+    assert cut.sum() == pytest.approx(1.3)
+
+
 def test_pulses_across_the_ends_of_the_period_fold_and_the_unrecorded_part_is_lost():
     at_zero = [ZoneReturns(np.zeros(1), np.zeros(1), np.ones(1))] * 2
     whole = zone_signal(at_zero, SENSOR, TWO)
