@@ -241,8 +241,9 @@ def test_saturation_is_the_event_by_event_simulation(recovery):
 @pytest.mark.parametrize("trials", [0.3, 1.4, 1.5, 3.6, 20.4])
 def test_draws_of_trials_that_are_no_whole_number_have_the_mean_of_the_law(trials):
     """A fit gives such numbers. Rounding them made counts of 0.3 trials 3.3 times as many, of 1.4 trials 29 % fewer."""
-    flux, many, rng, draws = np.array([[0.2, 0.05, 0.5, 0.1]]), np.array([trials]), np.random.default_rng(8), 20_000
-    drawn = np.array([draw_saturated(flux, many, 0.3, rng, 0.2)[0] for _ in range(draws)])
+    draws = 20_000
+    flux, many = np.tile([0.2, 0.05, 0.5, 0.1], (draws, 1)), np.full(draws, trials)  # as many zones, all alike
+    drawn = draw_saturated(flux, many, 0.3, np.random.default_rng(8), 0.2)
     expected = saturated(flux, many, 0.3, 0.2)[0]
     assert np.abs(drawn.mean(axis=0) - expected).max() < 5 * np.sqrt(expected.max() / draws)
     assert drawn.sum(axis=1).max() <= math.ceil(trials), "a trial gives one count at most"
