@@ -23,12 +23,13 @@ from spad.estimators.bistatic import (
 )
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
+from spad.sensor.pulse import REACH_SIGMAS
 
 FRAMES = 256  # bins of path length of a transient that no sensor has seen
 TAIL = 0.999  # share of the light that these span
 DIRECT_NS, INDIRECT_NS = 0.05, 1.0  # returns of a pixel that come closer together are one line
 BLOCK = 1024  # pixels whose rates are computed at once
-FINER = 4  # cells of a bin that arrivals are rounded to
+FINER = 4  # cells of a bin that rates are found from
 POINT = 1e-3  # cells below which a return has no length
 MIXED_LOW, MIXED_HIGH = 0.0, 1.0
 
@@ -149,10 +150,11 @@ def light_over_path(transient: Transient) -> Cube:
 
 def spread(cube: np.ndarray, row: np.ndarray, near: np.ndarray, far: np.ndarray, energy: np.ndarray) -> None:
     """Add returns, each uniform from `near` to `far` (in cells), to rows of a cube (P, T); what lies beyond T is left
-    out, what begins before 0 goes to the first cell."""
+    out, what begins before 0 begins there."""
     rows, cells = cube.shape
-    near, far = np.clip(near, 0, cells), np.clip(far, 0, cells)
-    length = far - near
+    near, far = np.maximum(near, 0), np.maximum(far, 0)
+    length = far - near  # before the cut: what lies beyond T has its part of the energy
+    near, far = np.minimum(near, cells), np.minimum(far, cells)
     point = length < POINT
     ramps = np.zeros((rows, cells + 2))
     # the light that has arrived rises with a constant slope from `near` to `far`: each kink's slope, then summed
@@ -201,14 +203,14 @@ def merged_returns(transient: Transient, scale: float, unit: str, *, period_ns: 
 def expected_cube(transient: Transient, sensor: Sensor, rates: Rates) -> np.ndarray:
     """Return the rates (H, W, T) float32 that detections are drawn from, before pile-up and dead time.
 
-    For looking: arrivals are rounded to quarters of a bin before the pulse is applied, by FFT over the period. The
-    exact rates of a pixel are those of `spad.detection.detect.expected_in_pixel`.
+    For looking: light is even in cells of a quarter of a bin. It is off by less than 2 % of a pixel's brightest bin
+    where the response's standard deviation is a bin or more, and keeps its sum. The exact rates of a pixel are those of
+    `spad.detection.detect.expected_in_pixel`.
     """
-    period = sensor.bins_per_period
+    period, edges = sensor.bins_per_period, sensor.code_edges
     fine = period * FINER
     per_cell = SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s / FINER
-    edges_s = (np.arange(fine + 1) - fine // 2 - 0.5) * sensor.bin_width_s / FINER
-    pulse = np.fft.rfft(np.roll(sensor.response.bin_masses(edges_s), -(fine // 2)))
+    pulse = np.fft.rfft(_pulse_in_cells(sensor, fine))
     pixels = transient.height * transient.width
     found = np.empty((pixels, sensor.bins), np.float32)
     alive = rates.signal_scale * rates.alive.reshape(-1)
@@ -216,15 +218,40 @@ def expected_cube(transient: Transient, sensor: Sensor, rates: Rates) -> np.ndar
         part = slice(start, min(start + BLOCK, pixels))
         mine = slice(int(transient.offsets[part.start]), int(transient.offsets[part.stop]))
         near, far = (path[mine].astype(float) / per_cell for path in (transient.path_near_m, transient.path_far_m))
+        short = np.maximum(0.5 * (1 - (far - near)), 0)  # what is shorter than a cell is one cell long
+        near, far = near - short, far + short
         turns = np.floor(near / fine) * fine  # time wraps at the period
-        light = np.zeros((part.stop - part.start, 2 * fine))
+        periods = int((far - turns).max(initial=0) // fine) + 1
+        light = np.zeros((part.stop - part.start, periods * fine))
         spread(light, transient.return_pixel[mine] - start, near - turns, far - turns, transient.radiance[mine])
-        light = light[:, :fine] + light[:, fine:]
+        light = light.reshape(-1, periods, fine).sum(axis=1)
         # a cell's light stands at its centre, a bin's edge between two of them
-        blurred = np.fft.irfft(np.fft.rfft(light, axis=1) * pulse, fine, axis=1).reshape(len(light), period, FINER)
-        signal = np.clip(blurred.sum(axis=2), 0, None)[:, : sensor.bins]
-        found[part] = signal * alive[part, None] + (rates.background.reshape(-1)[part] / period)[:, None]
+        blurred = np.clip(np.fft.irfft(np.fft.rfft(light, axis=1) * pulse, fine, axis=1), 0, None)
+        background = (rates.background.reshape(-1)[part] / period)[:, None]
+        if rates.converter is None or edges is None:
+            signal = blurred.reshape(-1, period, FINER).sum(axis=2)[:, : sensor.bins]
+        else:  # the bins cover the period
+            own = edges[rates.converter.reshape(-1)[part]]
+            signal, background = _between(blurred, own * FINER), background * np.diff(own)
+        found[part] = signal * alive[part, None] + background
     return found.reshape(transient.height, transient.width, sensor.bins)
+
+
+def _pulse_in_cells(sensor: Sensor, fine: int) -> np.ndarray:
+    """Return the response to an arrival at the centre of cell 0 of a period of `fine` cells, (fine,), folded."""
+    before, after = (math.ceil(part / sensor.period_s) for part in sensor.response.window_s(REACH_SIGMAS))
+    edges = np.arange(-before * fine, (after + 1) * fine + 1) - 0.5  # in cells
+    masses = sensor.response.bin_masses(edges * (sensor.bin_width_s / FINER))
+    return masses.reshape(-1, fine).sum(axis=0)
+
+
+def _between(light: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return light between neighbouring edges of each row, (P, F), (P, n + 1) in cells -> (P, n)."""
+    passed = np.pad(light.cumsum(axis=1), ((0, 0), (1, 1)), mode="edge")
+    passed[:, 0] = 0
+    cell = np.floor(edges).astype(np.int64)
+    before, after = (np.take_along_axis(passed, cell + step, axis=1) for step in (0, 1))
+    return np.diff(before + (edges - cell) * (after - before), axis=1)
 
 
 def transient_facts(transient: Transient) -> dict[str, str]:

@@ -121,7 +121,7 @@ def test_the_page_holds_the_counts_and_the_images(capfd):
 
 
 def test_rates_for_looking_are_those_that_sense_draws_from():
-    """Rounding arrivals to quarters of a bin moves little of the light: 1 % of a pixel's brightest bin at the most."""
+    """Quarters of a bin move little of the light: 1 % of a pixel's brightest bin at the most."""
     transient, histogram = read_transient(Path("gallery.exr")), read_histogram(Path("gallery.h5"))
     rates = rates_for(transient, histogram.sensor, histogram.budget)
     cube = expected_cube(transient, histogram.sensor, rates)
