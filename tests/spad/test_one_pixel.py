@@ -1,4 +1,4 @@
-"""Rates of one pixel by quadrature in numpy against the closed form in torch."""
+"""Rates of one pixel for figures, and light after the period, against the closed form in torch."""
 
 from dataclasses import replace
 
@@ -13,10 +13,12 @@ from spad.detection.one_pixel import quadrature_in_pixel
 from spad.detection.photons import PixelFlux, late_signal
 from spad.sensor.files import load_sensor
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
+from spad.sensor.pulse import SampledPulse
 
 # a point, a short and a long return, one before the camera's first bin is over, one that wraps around the period
 RETURNS = [(0.01, 0.01, 0.2), (4.0, 4.03, 1.0), (5.0, 7.5, 0.6), (29.97, 30.3, 0.4), (9.0, 9.0, 1e-3)]
-# panels are as long as a pulse is wide with its tail, and the steps of a measured one have corners
+# with the tolerance of light after the period: panels are as long as a pulse is wide with its tail, and the steps of a
+# measured one have corners
 SENSORS = {
     "reference": (Sensor(), 1e-6),
     "tail": (Sensor(pulse=Pulse(1e-10, 4e-10)), 1e-4),
@@ -25,16 +27,22 @@ SENSORS = {
     "linospad2": (load_sensor("linospad2").sensor, 1e-6),
     "reference-tdc": (load_sensor("reference-tdc").sensor, 1e-6),
 }
+# responses whose rise is far steeper than they are wide
+STEEP = {
+    "long tail": Sensor(pulse=Pulse(1e-11, 1e-9)),
+    "coarse steps": Sensor(pulse=SampledPulse((1.0, 8.0, 0.0, 0.0, 0.0, 5.0, 3.0), 3e-10)),
+}
 
 
-@pytest.mark.parametrize("name", SENSORS)
-def test_quadrature_is_the_closed_form(name):
-    sensor, tolerance = SENSORS[name]
-    transient, budget = transient_of(RETURNS, RETURNS[1:3], []), PhotonBudget(40, 25)
-    for column in range(3):
+@pytest.mark.parametrize("name", [*SENSORS, *STEEP])
+def test_expected_rates_of_a_pixel_are_the_closed_form(name):
+    sensor = STEEP[name] if name in STEEP else SENSORS[name][0]
+    lengths = [(4.0, 4.0 + length, 1.0) for length in (0.05, 0.15, 0.3, 0.6)]
+    transient, budget = transient_of(RETURNS, RETURNS[1:3], [], *([one] for one in lengths)), PhotonBudget(40, 25)
+    for column in range(7):
         exact = expected_in_pixel(transient, sensor, budget, 0, column, seed=3)
         found = quadrature_in_pixel(transient, sensor, budget, 0, column, seed=3)
-        assert found.shape == exact.shape and np.abs(found - exact).max() < tolerance * exact.max(), name
+        assert found.shape == exact.shape and np.abs(found - exact).max() < 1e-6 * exact.max(), name
 
 
 @pytest.mark.parametrize("law", ["poisson", "free-running"])
