@@ -204,7 +204,8 @@ def _estimated(
     if network is None:
         depth = choose(histogram.sensor)(histogram)
         seconds = time.perf_counter() - start
-        sure = confidence_map(histogram, depth, command.method)
+        # depths of codes are judged by all bins, as those of any method but one are
+        sure = confidence_map(histogram, depth, "coates" if command.method == "coates" else "log-matched")
     else:
         rule = command.int8_rule or "calibrated"
         reading["decoder"] = command.decoder or network.config.decoder
