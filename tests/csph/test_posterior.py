@@ -9,7 +9,7 @@ import torch
 
 from csph.codes.design import Design
 from csph.codes.rank import coherence, participation_rank, pixel_gram, separable_gram
-from csph.codes.temporal import orthogonal_start, uniform_start
+from csph.codes.temporal import orthogonal_start, spatial_seed, uniform_start
 from csph.layer import CompressiveLayer
 from csph.networks.config import ModelConfig
 from csph.networks.images import mirrored, spans
@@ -104,7 +104,7 @@ def test_an_orthogonal_start_has_full_rank_and_the_norms_of_the_uniform_one(code
     if codes % pixels == 0:
         assert participation_rank(flat.T @ flat) == pytest.approx(pixels, rel=1e-4)
     layer = CompressiveLayer.of(Design("learned", (32, side, side), codes), sensor=SMALL, spatial_start="orthogonal")
-    assert torch.equal(layer.spatial, orthogonal_start((codes, side, side), pixels, 1 << 32))
+    assert torch.equal(layer.spatial, orthogonal_start((codes, side, side), pixels, spatial_seed(0)))
 
 
 def test_mirrored_and_spans():
