@@ -239,8 +239,8 @@ def test_bad_input_is_one_line(capfd, packed, trained, tmp_path, monkeypatch):
     assert "--method network and --checkpoint or --model go together" in refused(capfd, *depth)
     assert "trained for another sensor" in refused(capfd, *depth, "--checkpoint", str(trained))
     evaluate = ["evaluate", str(trained), "--set", str(packed)]
-    assert "expected argmax" in refused(capfd, *evaluate, "--baselines", "guess")
-    assert "expected argmax" in refused(capfd, *evaluate, "--baselines", "fourier-²")
+    assert "method 'guess' is none of argmax" in refused(capfd, *evaluate, "--baselines", "guess")
+    assert "method 'fourier-²' is none of" in refused(capfd, *evaluate, "--baselines", "fourier-²")
     for level in ("10", "1+x", "0+5", "2+-1", "nan+1"):
         assert f"levels '{level}': expected" in refused(capfd, *evaluate, "--levels", level)
     paper = refused(capfd, "evaluate", str(trained), "--set", "published", "--levels", "1+1")
