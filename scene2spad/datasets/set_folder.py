@@ -109,7 +109,7 @@ class SetFolder:
 
     @property
     def closed(self) -> bool:
-        """Whether every record stands in the index."""
+        """Tell whether every record stands in the index."""
         return not (self.path / "journal.jsonl").exists()
 
     def missing(self, count: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""What must not change a render does not: things far away and unlit, the place, the size and the mesh of a scene."""
+"""Change what no render may depend on: things far away and unlit, place, side, size and triangles of a scene."""
 
 from __future__ import annotations
 
