@@ -197,7 +197,7 @@ def test_reading_damaged_files_ends_in_one_line():
 
 @pytest.mark.parametrize(("offset", "damage"), [(6, b"\x63"), (8, b"\x00\x08"), (46, b"\xff")])
 def test_damaged_directories_of_archives_are_one_line(tmp_path, capfd, offset, damage):
-    """Of the version that is needed, the flag of names in UTF-8, and a name."""
+    """Damage the version that is needed, the flag of names in UTF-8, and a name."""
     np.savez(tmp_path / "bad.npz", däta=np.ones(3))
     content = bytearray((tmp_path / "bad.npz").read_bytes())
     start = content.rindex(b"PK\x01\x02") + offset

@@ -59,7 +59,7 @@ def evaluated(capfd, *options: str) -> tuple[dict, list[str], list[dict]]:
 
 
 def test_an_evaluation_says_what_it_is_of(capfd, walls):
-    """Of two offsets the tables were told apart by the folder's name alone."""
+    """Tell tables of two offsets apart: before, the folder's name alone did."""
     for offset_m, law in ((1.0, "auto"), (0.0, None)):
         options = ("--offset", str(offset_m), "--seed", "4", "--decoder", "median", "--views", "1", "--tiled")
         more = () if law is None else ("--law", law)

@@ -99,7 +99,7 @@ def test_the_fits_model_is_the_sensors():
 
 
 def test_the_file_states_the_calibration_as_source_of_what_was_fitted_alone():
-    """What is off has no source; the width of a bin keeps the start's where it is the start's."""
+    """State no source for what is off; keep the start's for a width of a bin that is the start's."""
     model, values = truth()
     calibrated = as_sensor(model, values, SENSOR, ZONES)
     before = {"histogram.bin_width": "maker", "zones.delay": "older", "zones.echo": "older", "zones.width": "drawing"}

@@ -78,7 +78,7 @@ def test_published_pulses() -> None:
 
 @pytest.mark.parametrize("pulse", [Sensor().pulse, TRAIN.pulse], ids=["Gaussian", "measured"])
 def test_the_published_convention_knows_no_jitter_and_no_converters(pulse) -> None:
-    """Of the detector or of the clock, beside either kind of pulse: its taps would be too narrow."""
+    """Refuse jitter of detector and clock beside either kind of pulse: its taps would be too narrow."""
     sensor = replace(TRAIN, pulse=pulse, dark_count_rate_hz=0.0)
     even = Tdc(sensor.period_s / 4, codes=256)
     for jittery in (replace(sensor, jitter=Pulse(5e-11)), replace(sensor, tdc=replace(even, jitter_s=5e-11))):
@@ -90,7 +90,7 @@ def test_the_published_convention_knows_no_jitter_and_no_converters(pulse) -> No
 
 @pytest.mark.parametrize(("background", "fraction"), [(2, 0.94), (10, 0.76), (50, 0.39)])
 def test_published_dark_share(background: float, fraction: float) -> None:
-    """Of the mean background: what pixels without ambient light have."""
+    """Compare dark counts, as part of the mean background, with what pixels without ambient light have."""
     flat = np.ones((64, 64))
     ambient = np.tile([0.0, 2.0], (64, 32))
     found = published_from_rgbd(flat, flat, ambient, TRAIN, PhotonBudget(10, background)).background
