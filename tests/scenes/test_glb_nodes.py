@@ -1,4 +1,4 @@
-"""Nodes of a GLB as the standard means them: names of primitives, skins, morphs, what is hidden, samplers, metres."""
+"""Nodes and colours of a GLB as the standard means them: names of primitives, skins, morphs, samplers, metres."""
 
 from __future__ import annotations
 
@@ -228,3 +228,31 @@ def test_a_model_too_large_for_a_floor_is_refused_by_the_files_name(tmp_path: Pa
     with pytest.raises(InputError, match=r"planet\.glb: largest extent of 1e\+06 m is beyond the 100000 m"):
         load_mesh(path)
     assert load_mesh(path, placing=Placing(scale=1e-6)).surfaces
+
+
+@pytest.mark.parametrize(
+    ("material", "albedo"),
+    [
+        ({"pbrMetallicRoughness": {"baseColorFactor": [0.003] * 3 + [1]}}, 0.003),
+        ({"pbrMetallicRoughness": {"baseColorFactor": [0.5] * 3 + [1]}}, 0.5),
+        ({"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}}, 0.2126),
+        ({"pbrMetallicRoughness": {"baseColorFactor": [1.5] * 3 + [1]}}, 1),
+        ({"pbrMetallicRoughness": {}}, 1),
+        ({"name": "0"}, 1),
+    ],
+)
+def test_a_base_colour_is_what_its_material_states_and_white_by_default(
+    tmp_path: Path, material: dict, albedo: float
+) -> None:
+    """It was rounded to 8 bits, and 0.6 where it was left out, as it is of white ones."""
+    materials = [{"name": "0", "pbrMetallicRoughness": {"baseColorFactor": [0.1] * 3 + [1]}}, material]
+    path = glb(tmp_path / "a.glb", [{"mesh": 0}], meshes=[mesh(material=1)], materials=materials)
+    assert loaded(path).surfaces[0].material.albedo == pytest.approx(albedo, rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.5, [0.5, 0.5], ["a", 0, 0, 1], [float("nan"), 0, 0, 1], None])
+def test_a_base_colour_that_is_none_is_refused(tmp_path: Path, factor: object) -> None:
+    materials = [{"pbrMetallicRoughness": {"baseColorFactor": factor}}]
+    path = glb(tmp_path / "a.glb", [{"mesh": 0}], meshes=[mesh(material=0)], materials=materials)
+    with pytest.raises(InputError, match=r"^.*baseColorFactor of material 0.*$"):
+        loaded(path)

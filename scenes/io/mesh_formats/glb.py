@@ -8,11 +8,12 @@ import struct
 import warnings
 from collections.abc import Callable, Iterator
 
+from scenes.arrays import finite_number
 from scenes.errors import InputError, listed, require
 from scenes.io.inputs import parse_json
 from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb_nodes import plain_nodes
-from scenes.io.textures import check_checksums
+from scenes.io.textures import WHITE, Colour, check_checksums
 from scenes.json_types import JsonObject
 
 _GLB_INDICES = (
@@ -53,6 +54,7 @@ def check_glb(content: bytes, read: ReadImage) -> None:
         for mesh in header.get("meshes", []):
             for primitive in mesh["primitives"]:
                 _check_primitive(header, primitive)
+        _stated_colours(header)
         for number in sorted(_used_images(header)):
             _check_image(header, number, binary, read)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
@@ -207,23 +209,48 @@ def _check_primitive(header: JsonObject, primitive: JsonObject) -> None:
 
 
 def plain_glb(content: bytes) -> bytes:
-    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, and 16-bit vertex colours with a material.
+    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, materials named by their numbers, and 16-bit
+    vertex colours with a material.
 
     trimesh keeps such colours as they are only beside a material.
     """
     header, binary = _glb_chunks(content)
     plain_nodes(header, binary)
+    header["materials"] = [{**one, "name": str(number)} for number, one in enumerate(header.get("materials", []))]
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" not in one]
     colours = [(one, one["attributes"].get("COLOR_0")) for one in primitives]
     wide = [one for one, at in colours if at is not None and header["accessors"][at]["componentType"] == _GLB_USHORT]
     if wide:
-        header["materials"] = [*header.get("materials", []), {}]
+        header["materials"].append({})
     for one in wide:
         one["material"] = len(header["materials"]) - 1
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
     rest = content[20 + struct.unpack_from("<I", content, 12)[0] :]
     return content[:8] + struct.pack("<II4s", 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+
+
+def base_colours(content: bytes) -> dict[str, Colour]:
+    """Return the base colours of a sound GLB, linear RGB, white where none is stated, by their names in `plain_glb`.
+
+    trimesh rounds them to 8 bits, which is a third of a black of 0.003. Colours that it works out of an extension are
+    not among them.
+    """
+    return _stated_colours(_glb_chunks(content)[0])
+
+
+def _stated_colours(header: JsonObject) -> dict[str, Colour]:
+    found = {}
+    for number, material in enumerate(header.get("materials", [])):
+        factor = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [*WHITE, 1])
+        where = f"baseColorFactor of material {number}"
+        require(
+            isinstance(factor, list) and len(factor) in (3, 4), f"{where} is {str(factor)[:80]}, expected 4 numbers"
+        )
+        red, green, blue = (min(max(finite_number(one, where), 0.0), 1.0) for one in factor[:3])
+        if _READ_MATERIALS not in material.get("extensions", {}):
+            found[str(number)] = red, green, blue
+    return found
 
 
 def _used_images(header: JsonObject) -> set[int]:

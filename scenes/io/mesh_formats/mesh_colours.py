@@ -10,9 +10,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.errors import InputError, require
+from scenes.io.inputs import read_bytes
+from scenes.io.mesh_formats.glb import base_colours
 from scenes.io.mesh_formats.mesh_files import ply_texture, read_material_library
 from scenes.io.mesh_formats.mtl import MaterialEntry
-from scenes.io.textures import MAX_PIXELS, image_values, load_texture, luminance, opened_image, srgb_to_linear
+from scenes.io.textures import (
+    MAX_PIXELS,
+    WHITE,
+    Colour,
+    image_values,
+    load_texture,
+    luminance,
+    opened_image,
+    srgb_to_linear,
+)
 from scenes.model import Material, Texture
 
 if TYPE_CHECKING:
@@ -43,7 +54,9 @@ class Paint:
 
     def __init__(self, path: Path, notes: list[str]) -> None:
         self.path, self.notes = path, notes
-        self.library = read_material_library(path, notes) if path.suffix.lower() == ".obj" else {}
+        kind = path.suffix.lower()
+        self.library = read_material_library(path, notes) if kind == ".obj" else {}
+        self.base_colours = base_colours(read_bytes(path)) if kind == ".glb" else {}
         self.made: dict[object, Material] = {}
 
     def material(self, part: Part) -> Material:
@@ -103,9 +116,9 @@ class Paint:
 
     def _glb_albedo(self, part: Part, source: TextureMaterial) -> Albedo | float | None:
         image = getattr(source, "baseColorTexture", None) or getattr(source, "image", None)
-        factor, mean = getattr(source, "baseColorFactor", None), self._mean_colour(part)
-        tint = np.ones(4) if factor is None else np.asarray(factor) / 255
-        tint[:3] *= 1 if mean is None else mean
+        factor, mean = self._base_colour(source), self._mean_colour(part)
+        tint = np.array(WHITE if factor is None else factor)
+        tint *= 1 if mean is None else mean
         if getattr(source, "alphaMode", None) in ("MASK", "BLEND"):
             self.notes.append(f"{part.name}: alpha is left out, its surface is opaque")
         if image is not None and self._is_mapped(part):
@@ -113,8 +126,14 @@ class Paint:
             message = f"{self.path}: the texture of {part.name} has {pixels} pixels, the limit is {MAX_PIXELS}"
             require(pixels <= MAX_PIXELS, message)
             return (id(image), tint.tobytes()), lambda: _image_albedo(image, tint)
-        # glTF's factor is linear already
-        return None if factor is None and mean is None else float(luminance(tint))
+        unknown = factor is None or (image is not None and factor == WHITE)
+        return None if unknown and mean is None else float(luminance(tint))
+
+    def _base_colour(self, source: TextureMaterial) -> Colour | None:
+        """Return the linear base colour of a GLB's material; None of one that trimesh or this program made, without."""
+        made = getattr(source, "baseColorFactor", None)
+        without = None if made is None else tuple(np.asarray(made)[:3] / 255)
+        return self.base_colours.get(str(source.name), without)
 
     def _is_mapped(self, part: Part) -> bool:
         """Return whether a part has texture coordinates, with a note where it has none for its image."""
@@ -153,5 +172,5 @@ def _image_albedo(image: Image.Image, tint: np.ndarray) -> Texture:
     values = image_values(image)
     made = np.empty(values.shape[:2], np.float32)
     for row in range(0, len(values), 64):  # a few at a time: in double precision an image takes 100 bytes a pixel
-        made[row : row + 64] = np.clip(luminance(values[row : row + 64] * tint[:3]), 0.0, 1.0)
+        made[row : row + 64] = np.clip(luminance(values[row : row + 64] * tint), 0.0, 1.0)
     return Texture(made, "base colour")
