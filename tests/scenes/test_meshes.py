@@ -334,6 +334,19 @@ def test_reads_old_encodings_in_comments(tmp_path):
     assert load_mesh(tmp_path / "latin.obj").triangles == 5
 
 
+@pytest.mark.parametrize("marked", ["a.obj", "a.mtl", "a.ply", "a.stl"])
+def test_a_byte_order_mark_changes_nothing(tmp_path, marked):
+    """It hid the first word of its file: the first vertex of a mesh, or the first material, was lost."""
+    trimesh.creation.box((1, 1, 0.5)).export(tmp_path / "a.ply", encoding="ascii")
+    trimesh.creation.box((1, 1, 0.5)).export(tmp_path / "a.stl", file_type="stl_ascii")
+    write(tmp_path / "a.mtl", "newmtl a\nKd 0.25 0.25 0.25\n")
+    path = write(tmp_path / "a.obj", "v -1 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nmtllib a.mtl\nusemtl a\nf 1 2 3\n")
+    path = path if marked == "a.mtl" else tmp_path / marked
+    scene = load_mesh(path)
+    (tmp_path / marked).write_bytes(b"\xef\xbb\xbf" + (tmp_path / marked).read_bytes())
+    assert load_mesh(path).digest() == scene.digest()
+
+
 # --- Well-known models -----------------------------------------------------------------------------------------------
 
 

@@ -15,7 +15,7 @@ from scenes.errors import InputError, listed, require
 from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb import check_glb, plain_glb
-from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library
+from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library, without_mark
 from scenes.io.mesh_formats.obj import alike_obj, obj_fault, plain_obj
 from scenes.io.mesh_formats.ply import plain_ply
 from scenes.io.mesh_formats.stl import check_stl
@@ -55,7 +55,7 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
     """
     import trimesh
 
-    content = original = read_bytes(path, "mesh file")
+    content = original = without_mark(read_bytes(path, "mesh file"))
     beside = _Beside(path)
     try:
         content, triangles = _checked(content, kind, beside)
@@ -181,7 +181,7 @@ def _with_one_library(content: bytes, beside: _Beside) -> bytes:
     if not names:
         return content
     there = [name for name in names if (beside.folder / name.replace("\\", "/")).exists()]
-    lines = [line.strip() for name in there for line in beside.get(name).splitlines()]
+    lines = [line.strip() for name in there for line in without_mark(beside.get(name)).splitlines()]
     beside.made["all.mtl"] = b"\n".join(line for line in lines if line.lower().startswith(b"newmtl"))
     return b"mtllib all.mtl\n" + re.sub(rb"^mtllib.*", b"", content, flags=re.MULTILINE)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -59,9 +60,14 @@ class MaterialEntry:
         return f"map_Kd is multiplied by its Kd, {' '.join(f'{value:g}' for value in self.colour)}"
 
 
+def without_mark(content: bytes) -> bytes:
+    """Return text without the byte order mark that editors put before it, which would be part of its first word."""
+    return content.removeprefix(codecs.BOM_UTF8)
+
+
 def lenient_text(path: Path) -> str:
     """Read a text file: names and comments in any encoding, numbers never."""
-    return read_bytes(path).decode("utf-8", errors="replace")
+    return without_mark(read_bytes(path)).decode("utf-8", errors="replace")
 
 
 def read_library(library: Path, notes: list[str]) -> dict[str, MaterialEntry]:
