@@ -158,6 +158,18 @@ def test_normals_of_the_file_are_kept(tmp_path):
     assert sorted(normals.tolist()) == [[0, 0, 1], [0, 0, 1], pytest.approx([0, 0.6, 0.8])]
 
 
+@pytest.mark.parametrize("none", ["0 0 0", "nan nan nan"])
+def test_a_normal_of_no_direction_leaves_the_others_as_they_are(tmp_path, none):
+    """It took all of them from the mesh, even that of a vertex that no face uses."""
+    head = "ply\nformat ascii 1.0\nelement vertex 5\n" + "".join(
+        f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz")
+    )
+    faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = f"0 0 0 {none}\n1 0 0 0.6 0 0.8\n1 1 0 0 0.6 0.8\n0 1 0 0 0 1\n9 9 9 {none}\n3 0 1 2\n3 0 2 3\n"
+    normals = model(load_mesh(write(tmp_path / "n.ply", head + faces + rows)))[0].normals
+    assert normals == pytest.approx(np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8), (0, 0, 1)]), abs=1e-6)
+
+
 # --- Colours ---------------------------------------------------------------------------------------------------------
 
 

@@ -168,8 +168,9 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
     # trimesh computes normals on demand; only those that it read from the file are in its cache before that.
     normals = np.asarray(mesh.vertex_normals) if "vertex_normals" in mesh._cache else None
     if normals is not None:
-        usable = np.isfinite(normals).all() and (np.linalg.norm(normals, axis=1) > 0).all()
-        normals = shapes.transform_normals(normals, pose) if usable else None
+        normals = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
+        filled = shapes.filled_normals(normals, vertices, faces)
+        normals = shapes.transform_normals(filled, pose) if normals[faces].any() else None
     if np.linalg.det(pose[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
     beside = mesh.visual if "color" in getattr(mesh.visual, "vertex_attributes", {}) else mesh
