@@ -214,14 +214,15 @@ def test_a_text_stl_with_a_word_for_a_number_is_refused(tmp_path):
     mesh_refusal(path)
 
 
-def test_a_glb_without_its_texture_is_refused(tmp_path):
+@pytest.mark.parametrize(("uri", "name"), [("gone%20now.png", "gone now.png"), ("a b%.png", "a b%.png")])
+def test_a_glb_without_its_texture_is_refused(tmp_path, uri, name):
     def elsewhere(header: dict) -> None:
-        header["images"][0] = {"uri": "gone.png"}
+        header["images"][0] = {"uri": uri}
 
-    assert "gone.png" in mesh_refusal(edited_glb(textured_glb(tmp_path / "a.glb"), elsewhere))
-    (tmp_path / "gone.png").write_text("no image")
+    assert uri in mesh_refusal(edited_glb(textured_glb(tmp_path / "a.glb"), elsewhere))
+    (tmp_path / name).write_text("no image")
     assert "no image that can be read" in mesh_refusal(tmp_path / "a.glb")
-    Image.new("RGB", (4, 4), (200, 100, 50)).save(tmp_path / "gone.png")
+    Image.new("RGB", (4, 4), (200, 100, 50)).save(tmp_path / name)
     paths = tmp_path / "a.glb", textured_glb(tmp_path / "b.glb")
     beside, within = (load_scene(str(path)).surfaces[0].material.albedo.image for path in paths)
     assert np.array_equal(beside, within)

@@ -2,6 +2,8 @@
 
 import math
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -357,6 +359,15 @@ def test_a_byte_order_mark_changes_nothing(tmp_path, marked):
     scene = load_mesh(path)
     (tmp_path / marked).write_bytes(b"\xef\xbb\xbf" + (tmp_path / marked).read_bytes())
     assert load_mesh(path).digest() == scene.digest()
+
+
+def test_a_word_in_a_normal_of_a_text_stl_is_passed_over_in_silence(tmp_path):
+    """Its normals are not used; trimesh's traceback went to stderr where nobody had set up any logging."""
+    text = trimesh.exchange.stl.export_stl_ascii(trimesh.creation.box())
+    write(tmp_path / "a.stl", text.replace("facet normal ", "facet normal up", 1))
+    code = "import sys; from scenes.io.mesh_formats.meshes import load_mesh; print(load_mesh(sys.argv[1]).triangles)"
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.stl")], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("16\n", "")
 
 
 # --- Well-known models -----------------------------------------------------------------------------------------------

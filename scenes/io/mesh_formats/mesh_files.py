@@ -4,10 +4,12 @@ their folder."""
 from __future__ import annotations
 
 import io
+import logging
 import re
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -25,20 +27,31 @@ if TYPE_CHECKING:
 
 MAX_COORDINATE = 1e12  # in the file's unit: squares and cross products of such stay finite in double precision
 MAX_TRIANGLES = 1 << 25  # with all instances: a scene's arrays take some 200 bytes a triangle
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # without one, its tracebacks go to stderr
 MAGIC = {b"ply": ".ply", b"glTF": ".glb", b"solid": ".stl"}
 
 
 class _Beside:
-    """Files beside a mesh, for trimesh: regular ones inside the mesh's folder alone."""
+    """Files beside a mesh, for trimesh: regular ones inside the mesh's folder alone.
+
+    Those of a .glb are named by URIs, in which %20 stands for a blank; not all programs write it so.
+    """
 
     def __init__(self, path: Path) -> None:
         self.folder, self.file_name = path.parent, path.name  # trimesh names geometry by the file
         self.made: dict[str, bytes] = {}  # what is there in place of files
 
     def get(self, name: str) -> bytes:
-        if name.strip() in self.made:
-            return self.made[name.strip()]
-        return read_bytes(file_inside(self.folder, name.strip()))
+        name = name.strip()
+        if name in self.made:
+            return self.made[name]
+        decoded = unquote(name) if self.file_name.lower().endswith(".glb") else name
+        try:
+            return read_bytes(file_inside(self.folder, decoded))
+        except InputError:
+            if decoded == name:
+                raise
+            return read_bytes(file_inside(self.folder, name))
 
     def __getitem__(self, name: str) -> bytes:
         return self.get(name)
