@@ -134,7 +134,8 @@ def check_checksums(image: Image.Image) -> None:
 def exr_channels(path: Path, what: str = "image file") -> dict[str, np.ndarray]:
     """Return the channels of a flat EXR, float64, by name, its declared size checked before any pixel is decoded."""
     channels, _ = read_flat_exr(path, what)
-    return {name: np.asarray(pixels, np.float64) for name, pixels in channels.items()}
+    with np.errstate(invalid="ignore"):  # of signalling NaNs, which stay what they are
+        return {name: np.asarray(pixels, np.float64) for name, pixels in channels.items()}
 
 
 def read_flat_exr(path: Path, what: str = "image file") -> tuple[dict[str, np.ndarray], dict[str, object]]:

@@ -1,11 +1,13 @@
-"""Check that notes name what a camera of a Mitsuba file leaves out."""
+"""Check that notes name what a camera of a Mitsuba file leaves out, and what a transform of large numbers is."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from scenes import Surface
 from tests.scenes.xml_files import SENSOR, load
 
 
@@ -43,3 +45,15 @@ def test_an_axis_that_is_not_of_unit_length_is_named(tmp_path: Path, version: st
     turn = f'<transform name="to_world"><rotate {axis} angle="20"/><translate z="2"/></transform>'
     notes = load(tmp_path, f'<shape type="rectangle" id="board">{turn}</shape>', version=version).notes
     assert sum("<rotate>" in note and note.endswith(": board") for note in notes) == noted
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_length_of_an_axis_has_no_part_in_a_transform(tmp_path: Path) -> None:
+    """Squares of 1e300 overflowed: numpy's warnings went to stderr, and a turn became none."""
+
+    def turned(step: str) -> Surface:
+        return load(tmp_path, f'<shape type="cube"><transform name="to_world">{step}</transform></shape>').surfaces[0]
+
+    for step in ('<rotate z="{}" angle="30"/>', '<lookat origin="0 0 0" target="{} 0 0" up="0 {} 0"/>'):
+        unit, long = (turned(step.format(length, length)).vertices for length in ("1", "1e300"))
+        np.testing.assert_allclose(long, unit, atol=1e-12)

@@ -248,7 +248,8 @@ class Plugin:
         if element.tag != "transform":
             raise self.fail(f"{name} is a <{element.tag}>, expected <transform>")
         for step in element:
-            matrix = self._step(name, step) @ matrix
+            with np.errstate(over="ignore", invalid="ignore"):
+                matrix = self._step(name, step) @ matrix
             largest = float(np.abs(matrix).max())
             if not largest <= MAX_ENTRY:
                 raise self.fail(f"{name}: <{step.tag}> makes an entry of {largest:g}, beyond {MAX_ENTRY:g}")
@@ -303,7 +304,7 @@ class Plugin:
 
     def _rotation(self, axis: np.ndarray, angle: float) -> np.ndarray:
         """Rotation about an axis by an angle in radians (Rodrigues)."""
-        length = np.linalg.norm(axis)
+        length = math.hypot(*axis)  # of large numbers, too, whose squares are beyond all
         if length == 0:
             raise self.fail("<rotate> has no axis, expected x, y or z")
         if abs(length - 1) > AXIS_TOLERANCE and not self.document.legacy:
@@ -316,14 +317,13 @@ class Plugin:
         """Mitsuba's camera frame: columns left, up, forward, origin."""
         origin, target = (np.array(self.numbers(self.document.need(step, key), key, 3)) for key in ("origin", "target"))
         forward = target - origin
-        if np.linalg.norm(forward) == 0:
+        if not forward.any():
             raise self.fail(f"<{step.tag}>: origin and target are the same point")
-        forward = forward / np.linalg.norm(forward)
+        forward = forward / math.hypot(*forward)
         up = np.array(self.numbers(step.get("up", "0 0 0"), "up", 3))
-        if not up.any():
-            up = axis_frame(forward)[:, 0]
+        up = up / math.hypot(*up) if up.any() else axis_frame(forward)[:, 0]
         left = np.cross(up, forward)
-        if np.linalg.norm(left) < 1e-9 * np.linalg.norm(up):
+        if np.linalg.norm(left) < 1e-9:
             raise self.fail(f"<{step.tag}>: up is along the viewing direction")
         left = left / np.linalg.norm(left)
         matrix = np.eye(4)
