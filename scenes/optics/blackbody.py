@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -13,6 +14,7 @@ BOLTZMANN_J_PER_K = 1.380649e-23
 SUN_TEMPERATURE_K = 5778.0
 # Luminous efficacy of radiation at 555 nm, where the eye is most sensitive.
 PEAK_EFFICACY_LM_PER_W = 683.0
+HARDLY_SEEN_NM = 0.1  # a thousandth of the eye's response, 107 nm wide
 
 
 def planck_w_per_m2_nm(wavelength_m: np.ndarray | float, temperature_k: float = SUN_TEMPERATURE_K) -> np.ndarray:
@@ -56,3 +58,21 @@ def seen_radiance_w_per_m2_sr_nm(temperature_k: float) -> float:
     """Return spectral radiance of a black body as the eye weights it: its mean over V(lambda), 360 to 830 nm."""
     grid = np.arange(360e-9, 830e-9, 1e-9)
     return float(np.average(planck_w_per_m2_nm(grid, temperature_k), weights=photopic(grid))) / math.pi
+
+
+def seen_mean(spectrum: Iterable[Sequence[float]]) -> float:
+    """Return the mean of a spectrum as the eye weights it, over V(lambda): of colours, what their luminance is.
+
+    spectrum  pairs of a wavelength [nm] and a value, which is linear between them; nothing is known beyond them
+
+    A spectrum that the eye hardly sees, as one in the infrared, has its plain mean over wavelength.
+    """
+    wavelength, value = np.array(sorted(map(tuple, spectrum))).T
+    seen = np.arange(360.0, 831.0)
+    grid = np.union1d(wavelength, seen[(seen > wavelength[0]) & (seen < wavelength[-1])])
+    with np.errstate(over="ignore"):  # of wavelengths beyond all, which are not seen
+        values, weights = np.interp(grid, wavelength, value), photopic(grid * 1e-9)
+    if np.trapezoid(weights, grid) < HARDLY_SEEN_NM:
+        weights = np.ones_like(grid)
+    whole = np.trapezoid(weights, grid)
+    return float(np.trapezoid(weights * values, grid) / whole if whole > 0 else value.mean())

@@ -23,7 +23,7 @@ AIR = 1.000277
         ('<rgb name="reflectance" value="#808080"/>', float(srgb_to_linear(128 / 255))),
         ('<srgb name="reflectance" value="0.5 0.5 0.5"/>', float(srgb_to_linear(0.5))),
         ('<spectrum name="reflectance" value="0.25"/>', 0.25),
-        ('<spectrum name="reflectance" value="400:0.1, 500:0.2 600:0.6"/>', 0.275),
+        ('<spectrum name="reflectance" value="400:0.3, 500:0.3 600:0.3"/>', 0.3),
         ('<float name="reflectance" value="0.7"/>', 0.7),
         ("", 0.5),
     ],
@@ -330,3 +330,31 @@ def test_a_dollar_takes_the_longest_known_name_as_in_mitsuba(tmp_path: Path, mit
     one = '<default name="res" value="1k"/>'
     made = material(tmp_path, f'<bsdf type="diffuse">{one}{texture.format("$res_oak.png")}</bsdf>')
     assert made.albedo.image.mean() == pytest.approx(srgb_to_linear(60 / 255))
+
+
+@pytest.mark.parametrize(
+    ("spectrum", "close"),
+    [
+        ("400:0.2, 700:0.8", 0.02),
+        ("400:0.2, 500:0.6, 700:0.3", 0.02),
+        ("450:0.7, 500:0.2, 550:0.1, 600:0.6, 650:0.9, 700:0.9", 0.06),
+        ("300:0.1, 400:0.1, 700:0.3, 1000:0.9, 2500:0.9", 0.02),
+    ],
+)
+def test_a_spectrum_is_as_bright_as_its_colour_in_mitsuba(
+    tmp_path: Path, mitsuba: object, spectrum: str, close: float
+) -> None:
+    """The last one was 3.6 times as bright: what the eye does not see counted as much as what it does."""
+    body = (
+        f'<shape type="rectangle"><bsdf type="diffuse"><spectrum name="reflectance" value="{spectrum}"/></bsdf></shape>'
+    )
+    path = write(tmp_path, body)
+    colour = mitsuba(path, rays=[([0.1, 0.1, 5], [0, 0, -1])])["hits"][0][2]
+    ours = load_mitsuba_xml(path).surfaces[0].material.albedo
+    assert ours == pytest.approx(float(luminance(np.array(colour))), rel=close)
+
+
+@pytest.mark.parametrize(("spectrum", "mean"), [("800:0.2, 900:0.8", 0.5), ("550:0.3", 0.3), ("500:0.4, 600:0.4", 0.4)])
+def test_a_spectrum_that_is_hardly_seen_has_its_plain_mean(tmp_path: Path, spectrum: str, mean: float) -> None:
+    body = f'<bsdf type="diffuse"><spectrum name="reflectance" value="{spectrum}"/></bsdf>'
+    assert material(tmp_path, body).albedo == pytest.approx(mean)

@@ -14,7 +14,7 @@ from scenes.geometry.shapes import axis_frame
 from scenes.io.inputs import read_text
 from scenes.io.mitsuba.nodes import Document
 from scenes.io.textures import luminance, srgb_to_linear
-from scenes.optics.blackbody import seen_radiance_w_per_m2_sr_nm
+from scenes.optics.blackbody import seen_mean, seen_radiance_w_per_m2_sr_nm
 
 COLOUR_TAGS = ("float", "integer", "rgb", "srgb", "spectrum")
 # Of a matrix: what is beyond leaves the range of numbers when matrices are multiplied, inverted or decomposed.
@@ -181,7 +181,7 @@ class Plugin:
             return self._mean_of_file(name, element)
         text = self.document.need(element, "value").strip()
         if element.tag == "spectrum" and ":" in text:
-            return _mean_over_wavelength(
+            return seen_mean(
                 [self.numbers(pair.replace(":", " "), name, 2) for pair in re.split(r"[\s,]+", text) if pair]
             )
         if element.tag in ("rgb", "srgb"):
@@ -191,7 +191,7 @@ class Plugin:
         return self.numbers(text, name, 1)[0]
 
     def _mean_of_file(self, name: str, element: Element) -> float:
-        """Return the mean of a .spd file: a wavelength and a value a line, # begins a comment."""
+        """Return the mean of a .spd file, as seen: a wavelength and a value a line, # begins a comment."""
         path = self.document.file(element, self.document.need(element, "filename"), "spectrum")
         text = read_text(path, "spectrum", most_bytes=MAX_SPECTRUM_BYTES)
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
@@ -199,7 +199,7 @@ class Plugin:
         if not pairs:
             raise self.fail(f"{path.name}: holds no wavelengths")
         self.note(f"{name} is the mean of its spectrum file")
-        return _mean_over_wavelength(pairs)
+        return seen_mean(pairs)
 
     def _blackbody(self, name: str, element: Element) -> float:
         """Radiance [W/(m^2 sr nm)] of <blackbody temperature="5000K"/> (version 0.6), or of version 3's spectrum."""
@@ -334,12 +334,6 @@ class Plugin:
 def snake_case(name: str) -> str:
     """Return Mitsuba 0.6's camelCase names as Mitsuba 3's: toWorld, intIOR -> to_world, int_ior."""
     return re.sub(r"(?<=[a-z0-9])([A-Z]+)", r"_\1", name).lower()
-
-
-def _mean_over_wavelength(pairs: list[list[float]]) -> float:
-    wavelength, value = np.array(sorted(map(tuple, pairs))).T
-    span = wavelength[-1] - wavelength[0]
-    return float(np.trapezoid(value, wavelength) / span if span > 0 else value.mean())
 
 
 def _or(counts: Iterable[int]) -> str:
