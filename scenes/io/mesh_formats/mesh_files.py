@@ -20,6 +20,7 @@ from scenes.io.mesh_formats.glb import check_glb, plain_glb
 from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library, without_mark
 from scenes.io.mesh_formats.obj import alike_obj, obj_fault, plain_obj
 from scenes.io.mesh_formats.ply import plain_ply
+from scenes.io.mesh_formats.polygons import without_dents
 from scenes.io.mesh_formats.stl import check_stl
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
             # trimesh parts a mesh where materials change, and normals that are made would have a crease there
             content = re.sub(rb"^usemtl.*", b"", content, flags=re.MULTILINE)
         if kind == ".obj":
+            content = content if options.get("skip_materials") else without_dents(content)  # Mitsuba cuts fans
             content, options["split_groups"] = alike_obj(content)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
