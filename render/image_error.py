@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from render.clamping import RemovedLight
+from render.direct.integrator import centre_layers
 from render.error import (
     UNKNOWN,
     CheckedPixels,
@@ -33,10 +34,11 @@ CLEAR = 3  # standard deviations above which a bias is believed
 def estimated_error(world: TracedScene, plan: Plan, traced: LightSamples) -> ErrorEstimate:
     """Estimate the error of a trace, from the checked pixels' batches and from finer direct light there.
 
-    It is UNKNOWN where these hold no light and others do, and where finer cells, too, may miss the laser's cone.
+    It is UNKNOWN where these hold no light and others do, where finer cells, too, may miss the laser's cone, and where
+    few paths looked for indirect light and all of the image is dark.
     """
     checked = traced.checked
-    if CHECK_REFINEMENT * plan.grid * cone_width_px(world) < 1:
+    if CHECK_REFINEMENT * plan.grid * cone_width_px(world) < 1 or _may_have_missed_all(world, plan, traced):
         return UNKNOWN
     coarse = response(select_pixels(traced.direct, checked.pixel), checked.pixel)
     glints = response(select_pixels(traced.specular, checked.pixel), checked.pixel)
@@ -76,6 +78,13 @@ def estimated_error(world: TracedScene, plan: Plan, traced: LightSamples) -> Err
 
 def _is_lit(traced: LightSamples) -> bool:
     return bool(traced.samples.radiance.any())
+
+
+def _may_have_missed_all(world: TracedScene, plan: Plan, traced: LightSamples) -> bool:
+    """Return whether a pilot found no light at all although what is seen reflects some."""
+    if plan.bounces == 1 or traced.indirect is not None or _is_lit(traced):
+        return False
+    return bool((centre_layers(world).albedo > 0).any())
 
 
 def _finer(world: TracedScene, plan: Plan, checked: CheckedPixels) -> np.ndarray:

@@ -135,6 +135,37 @@ def test_an_error_that_no_checked_pixel_tells_is_no_zero():
     assert estimated_error(world, plan, trace(world, plan, settings, seed=1, pilot=dark)).total == 1
 
 
+def aside(camera_m: tuple, laser_m: tuple) -> Scene:
+    """One pixel of half a degree, and a spot of as much that it does not see, on the same wall of a room."""
+    camera = Camera.look_at(camera_m, np.add(camera_m, (0.1, 0.05, 1)), fov_deg=0.5, width=1, height=1)
+    baseline_m = tuple(camera.rotation.T @ np.subtract(laser_m, camera_m))
+    return Scene("aside", (room(),), camera, Laser("flood", baseline_m, cone_deg=0.5))
+
+
+def test_light_of_a_spot_out_of_view_is_as_bright_the_other_way_round():
+    """Helmholtz: camera and laser change places. Paths that go on by chance never meet the spot."""
+    ends, settings = ((0, 0, -1), (0.7, 0.3, -1)), RenderSettings(bounces=4, spp=512)
+    sums = [
+        [render(aside(*places), settings, seed=seed).radiance.sum(dtype=float) for seed in range(4)]
+        for places in (ends, ends[::-1])
+    ]
+    one, other = np.mean(sums, axis=1)
+    error = np.sqrt(np.var(sums, axis=1, ddof=1).sum() / 4)
+    assert one > 0 and abs(one - other) < 5 * error and error < 0.02 * one
+
+
+def test_darkness_that_few_paths_found_is_no_certainty():
+    """The laser lights another part of a wall than the camera sees; where that is black no path could find any."""
+    stated = []
+    for albedo in (0.7, 0.0):
+        scene = aside((0, 0, -1), (0.7, 0.3, -1))
+        scene = Scene("wall", (oracles.wall(-4.0, albedo, half_size_m=9),), scene.camera, scene.laser)
+        found = render(scene, RenderSettings(bounces=3))
+        assert found.returns == 0 and np.isfinite(found.depth_m).all()
+        stated.append((found.meta["relative_error"]["total"], found.meta["target_met"]))
+    assert stated == [(1, False), (0, True)]
+
+
 def test_direct_light_leaves_noise_a_part_of_the_target():
     plan = make_plan(TracedScene(spot(40)), RenderSettings(direct_fraction=0.9, grid=8, error=0.1, bounces=2), 1)
     assert plan.noise**2 == pytest.approx(0.1 * 0.96 * 0.75 * 0.1**2)
