@@ -51,14 +51,15 @@ def specular_light(
 ) -> SpecularLight:
     """Return deterministic returns by way of smooth plane surfaces, as `Samples` merged within `tolerance_m`.
 
-    Glints: pixel-mean radiance T R_1 ... R_k I(w) / (D^2 Omega), with D the unfolded one-way length laser -> mirrors ->
-    camera, Omega the pixel's solid angle, T the transmission of glass on the way; path length D plus glass delay,
-    `bounces` = k. Mirrored light is integrated over grid x grid cells of each pixel: f cos R_1 ... I(w) / D^2 with D
-    the unfolded length from the laser to the surface, times the reflectances between surface and camera; `bounces`
-    counts every surface met. Light of more surfaces than the `bounces` asked for is left out. Where the cells of a
-    pixel are so uneven that its mean could be off by more than `allowed` (a radiance; 0: not asked), and on polished
-    surfaces, whose highlights may be smaller than a cell, there are FINER ones. Paths without a mirror on the laser's
-    side are not here: direct light and path tracing find them.
+    Glints: pixel-mean radiance T R_1 ... R_k I(w) F^2 / (D^2 cos^3 a), with D the unfolded one-way length laser ->
+    mirrors -> camera, F the focal length in pixels, a the angle off the optical axis (a pixel's mean is that over its
+    square, of which a direction sees cos^3 a / F^2 of solid angle), T the transmission of glass on the way; path length
+    D plus glass delay, `bounces` = k. Mirrored light is integrated over grid x grid cells of each pixel: f cos R_1 ...
+    I(w) / D^2 with D the unfolded length from the laser to the surface, times the reflectances between surface and
+    camera; `bounces` counts every surface met. Light of more surfaces than the `bounces` asked for is left out. Where
+    the cells of a pixel are so uneven that its mean could be off by more than `allowed` (a radiance; 0: not asked), and
+    on polished surfaces, whose highlights may be smaller than a cell, there are FINER ones. Paths without a mirror on
+    the laser's side are not here: direct light and path tracing find them.
 
     Raises InputError where a displaced laser's straight path through a glass slab is off by more than 10 mm.
     """
@@ -205,7 +206,8 @@ def _glints(world: TracedScene, tables: _Tables, mirrors: Mirrors, sequence: np.
     lit = energy > 0
     late = (weight * delay).sum(axis=1)[lit] / weight.sum(axis=1)[lit]
     row, column, distance, energy = row[lit], column[lit], distance[lit], energy[lit]
-    per_pixel = laser.intensity(camera)[row, column] / camera.pixel_solid_angle()[row, column]
+    axial = image[lit] @ camera.rotation[:, 2] / distance
+    per_pixel = laser.intensity(camera)[row, column] * camera.focal_px**2 / axial**3
     return Samples(
         row * camera.width + column,
         np.round(distance + late, 9),  # the ways through a corner cube have one length, whatever rounding says

@@ -41,12 +41,12 @@ def scene_of(*surfaces: Surface, laser: Laser | None = None, view: Camera | None
 
 
 def glint(scene: Scene, toward, reflectance: float, one_way_m: float) -> tuple[int, float]:
-    """Pixel and radiance R I / (D^2 Omega) of the laser seen in the direction `toward`."""
+    """Pixel and radiance R I F^2 / (D^2 cos^3) of the laser seen in the direction `toward`."""
     view = scene.camera
-    x, y, z = np.array(toward, float) @ view.rotation
+    x, y, z = np.array(toward, float) @ view.rotation / np.linalg.norm(toward)
     column = math.floor(view.focal_px * x / z + view.width / 2)
     row = math.floor(view.focal_px * y / z + view.height / 2)
-    per_pixel = scene.laser.intensity(view)[row, column] / view.pixel_solid_angle()[row, column]
+    per_pixel = scene.laser.intensity(view)[row, column] * view.focal_px**2 / z**3
     return row * view.width + column, reflectance * per_pixel / one_way_m**2
 
 

@@ -36,13 +36,14 @@ def mirror_return(
 ) -> tuple[tuple[int, int], float]:
     """Return pixel (row, column) that looks `toward` a laser's mirror image, and its pixel-mean radiance [1/(m^2 sr)].
 
-    The image at unfolded distance D sends the irradiance R I / D^2 from one direction: radiance R I / (D^2 Omega).
+    The image at unfolded distance D sends the irradiance R I / D^2 from one direction, at an angle a to the axis. A
+    pixel's mean is that over its square, as wide as the focal length over F: radiance R I F^2 / (D^2 cos^3 a).
     """
-    x, y, z = view.rotation.T @ np.asarray(toward, float)
+    x, y, z = view.rotation.T @ np.asarray(toward, float) / np.linalg.norm(toward)
     column = math.floor(x / z * view.focal_px + view.width / 2)
     row = math.floor(y / z * view.focal_px + view.height / 2)
-    intensity, solid_angle = laser.intensity(view)[row, column], view.pixel_solid_angle()[row, column]
-    return (row, column), float(reflectance * intensity / (one_way_m**2 * solid_angle))
+    per_pixel = laser.intensity(view)[row, column] * view.focal_px**2 / z**3
+    return (row, column), float(reflectance * per_pixel / one_way_m**2)
 
 
 def caustic_moments(
