@@ -114,7 +114,7 @@ class Job:
             SET_MIN_SPP,
         ]
         mode = self.offset_mode if self.offset_m else "time"  # of a scene that stays where it is they are all one
-        return asdict(self) | {"offset_mode": mode, "schema": 9, "tolerances": tolerances}
+        return asdict(self) | {"offset_mode": mode, "schema": 10, "tolerances": tolerances}
 
 
 def render_view(job: Job, view: int, again: int = 0) -> Done:
