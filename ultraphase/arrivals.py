@@ -18,6 +18,7 @@ place (M/D/1/1, Erlang's formula) it would be rho / (1 + rho).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -105,7 +106,8 @@ class TimedCore(Core):
                 self._frame_is_over = now >= frame_clocks
                 if asks == "BNT" and self._read == len(self._port):
                     now, idle = self._idle(word, now, waiting[came] if came < len(waiting) else frame_clocks, idle)
-                steps = 0 if asks == "RDT" else steps
+                if asks == "RDT":
+                    steps, idle = 0, None  # a turn with a photon in it is no idle one, whatever it leaves
             now += per * length
             word = does()
             if word < 0:
@@ -115,12 +117,12 @@ class TimedCore(Core):
                 raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
 
     def _idle(self, word: int, now: int, until: float, before: _Idle | None) -> tuple[int, _Idle]:
-        """Return the time of the look at the port that comes next before `until`: turns of an idle loop that leave the
-        core as it was are counted, not run."""
+        """Return the time of the last look at the port before `until`, when there is something to see: turns of an idle
+        loop that leave the core as it was are counted, not run."""
         state = (word, tuple(self.registers), bytes(self.ram))
         if before is not None and before[0] == state and now > before[1]:
             turn = now - before[1]
-            now += max(0, int((until - now) // turn)) * turn
+            now += max(0, math.ceil((until - now) / turn) - 1) * turn
         return now, (state, now)
 
     def _step_at(self, word: int) -> _Step:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.errors import InputError
-from ultraphase import ChipSpec, Core, method
+from ultraphase import ChipSpec, Core, assemble, method
 from ultraphase.arrivals import TimedCore, lost_fraction, poisson_arrivals
 from ultraphase.tables import int8_codes
 
@@ -59,6 +59,21 @@ def test_the_closed_form_becomes_the_queue_with_one_place():
         assert near == pytest.approx(with_one_place, rel=1e-5)
         assert lost_fraction(rho / 135, 135) > with_one_place  # looking now and then loses more
     assert lost_fraction(0.0, 135) == 0 and lost_fraction(1e3, 135) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "photon", [["ADD r2, r2, #1"], ["MOV r2, #1"], ["MOV r2, #1"] * 5], ids=["counted", "as it was", "longer"]
+)
+@pytest.mark.parametrize("whole", [True, False], ids=["whole clocks", "any time"])
+def test_turns_of_an_idle_loop_that_are_counted_are_as_if_they_were_run(photon, whole):
+    """Photons at the very clock of a look, and those that leave the core as it was, are seen when they are there."""
+    lines = ["wait: BNT none", "RDT r1", *photon, "JMP wait", "none: BFE end", "JMP wait", "end: HALT"]
+    core, random = TimedCore(assemble("\n".join(lines))), np.random.default_rng(6)
+    service = 3 * (3 + len(photon))
+    for _ in range(60):
+        clocks = np.sort(random.integers(0, 900, 30) if whole else 900 * random.random(30)).astype(float)
+        found = core.timed_frame(clocks, random.integers(0, 2, 30), 1500)
+        assert found.read == plain_queue(clocks, service, 9, 3)
 
 
 def test_photons_of_a_pulsed_laser_come_together_and_are_lost_more_often():
