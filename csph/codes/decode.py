@@ -14,6 +14,7 @@ from torch import Tensor
 from csph.codes.tensor import CodingTensor, as_tensor, encode
 from scenes.errors import InputError, require, require_kind
 from spad.estimators.depth import by_pixels, correlate, depth_in_range, grid_peak, noise_free_bias_m
+from spad.estimators.matching import is_circular
 from spad.sensor.model import Sensor
 from spad.sensor.template import FINE_STEP, pulse_taps
 
@@ -88,23 +89,27 @@ def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> Tensor:
     return templates / templates.norm(dim=-1, keepdim=True).clamp(min=1e-30)
 
 
-def _first_peak(scores: Tensor) -> Tensor:
+def _first_peak(scores: Tensor, circular: bool) -> Tensor:
     """Bin of the largest of (P, T) scores; the first of equals, not whichever rounding favours, and the middle of a
-    run of equals, as within the gates of a coarse histogram."""
+    run of equals, as within the gates of a coarse histogram. A run at the end of a circle goes on at its beginning."""
+    bins = scores.shape[-1]
     top = scores >= scores.amax(-1, keepdim=True) - _TIE * scores.abs().amax(-1, keepdim=True)
     first = top.byte().argmax(-1, keepdim=True)
-    beyond = ~top & (torch.arange(scores.shape[-1], device=scores.device) > first)
-    end = torch.where(beyond.any(-1), beyond.byte().argmax(-1), scores.shape[-1])
-    return (first.squeeze(-1) + end - 1) // 2
+    beyond = ~top & (torch.arange(bins, device=scores.device) > first)
+    end = torch.where(beyond.any(-1), beyond.byte().argmax(-1), bins)
+    start = first.squeeze(-1)
+    if circular:
+        start = torch.where(top[:, 0] & (end < bins), -(~top).flip(-1).byte().argmax(-1), start)
+    return (start + end - 1).div(2, rounding_mode="floor") % bins
 
 
 def _raw_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
     templates = _templates(coding, sensor, str(codes.device))
     centre = templates.shape[1] // 2
-    coarse = templates[:, centre].float().T
+    coarse, circular = templates[:, centre].float().T, is_circular(sensor)
 
     def one(part: Tensor) -> Tensor:
-        peak = _first_peak(part.float() @ coarse)
+        peak = _first_peak(part.float() @ coarse, circular)
         # In float64: of K = 2 codes the score changes by 3e-7 over an eighth of one of 1024 bins.
         scores = (templates[peak] @ part.double().unsqueeze(-1)).squeeze(-1)
         bins = peak + 0.5 + (grid_peak(scores) - centre) * FINE_STEP

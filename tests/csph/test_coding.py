@@ -131,6 +131,18 @@ def test_fourier_decodes_the_noise_free_pulse(codes: int, background: float) -> 
     assert error_mm.abs().max() < limit
 
 
+@pytest.mark.parametrize("codes", [2, 4])
+def test_fourier_decodes_around_the_end_of_many_bins(codes: int) -> None:
+    """Neighbouring bins score alike to float32 there: their run goes around the end of the circle."""
+    sensor = Sensor(name="fine", bins=16384, bin_width_s=6.1e-12)
+    coding = fourier(codes, sensor.bins)
+    for around in (0.0, 8192.0):
+        arrival = torch.remainder(around + torch.linspace(-6, 6, 49).double(), sensor.bins) * sensor.bin_width_s
+        counts = 1e4 * binned_pulse(arrival, sensor)
+        error_m = wrapped_error(decode_depth(encode(counts, coding), coding, sensor), arrival, sensor)
+        assert (error_m / sensor.bin_depth_m).abs().max() < 0.01
+
+
 def test_a_decoder_that_answers_late_is_put_right(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = torch.from_numpy(np.random.default_rng(6).poisson(2.0, (20, 64)))
     codes = truncated_fourier(8, 64)
