@@ -71,6 +71,12 @@ def test_programs_of_the_package_survive_the_round_trip(name):
     assert again.words == program.words and again.regions == program.regions
 
 
+def test_labels_of_disassembled_programs_are_no_names_of_ram():
+    program = assemble(".space L1, u8, 1\n.space L_1, u8, 1\n MOV r1, #1\nturn: LDB r2, [L1]\n JMP turn\n")
+    again = assemble(disassemble(program.words, program.regions))
+    assert again.words == program.words and again.regions == program.regions
+
+
 def test_listing_has_every_word_with_its_source_line():
     program = method("fourier-8").program()
     text = listing(program)

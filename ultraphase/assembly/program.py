@@ -199,13 +199,16 @@ def disassemble(words: tuple[int, ...], regions: tuple[Region, ...] = ()) -> str
     instruction."""
     instructions = [decode(word) for word in words]
     targets = sorted({i.target for i in instructions if "l" in i.op.takes})
+    taken, start = {region.name for region in regions}, "L"
+    while any(f"{start}{target}" in taken for target in targets):
+        start += "_"
     lines = []
     for r in regions:
         values = "".join(f", {value}" for value in r.values)
         lines.append(f".{'table' if r.table else 'space'} {r.name}, {r.kind}, {r.count}{values}")
     for address, instruction in enumerate(instructions):
         if address in targets:
-            lines.append(f"L{address}:")
-        lines.append(f"        {format_instruction(instruction, lambda target: f'L{target}')}")
-    lines += [f"L{target}:" for target in targets if target == len(instructions)]
+            lines.append(f"{start}{address}:")
+        lines.append(f"        {format_instruction(instruction, lambda target: f'{start}{target}')}")
+    lines += [f"{start}{target}:" for target in targets if target == len(instructions)]
     return "\n".join(lines) + "\n"
