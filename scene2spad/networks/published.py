@@ -225,7 +225,8 @@ def errors_as_published(model: DepthEstimator, histogram: Histogram, decoder: De
     early = published_centroid_bins(sensor)  # in bins after the fullest
     found: dict[str, float] = {}
     for name, estimate in (("label", bins - 0.5), ("arrival", bins - 0.5 - early)):
-        errors = image_errors(estimate * step_m, histogram.depth_m, range_m=np.inf)
+        # what is sure of the first bin is half a bin deep but for rounding, and no depth is below 0
+        errors = image_errors(np.maximum(estimate, 0) * step_m, histogram.depth_m, range_m=np.inf)
         found |= {f"{figure}_{name}": errors[figure] for figure in ("mae_mm", "rmse_mm", "within_10mm")}
     return found
 

@@ -206,6 +206,10 @@ def test_arrival_lies_where_the_published_pulse_has_its_centroid(tmp_path):
     early_mm = 1e3 * (taps.argmax() - taps @ np.arange(len(taps))) * 3e8 * SENSOR.bin_width_s / 2
     assert errors["mae_mm_arrival"] < 0.1
     assert errors["mae_mm_label"] == pytest.approx(early_mm, abs=0.1) and 6.3 < early_mm < 6.6
+    # one that is sure of the first bin, half a bin deep but for rounding
+    first = np.full(pair.depth_m.shape, np.nextafter(np.float32(0.5 * SENSOR.bin_depth_m), np.float32(0)))
+    least = published.errors_as_published(SimpleNamespace(depth_of=lambda *_, **__: (first, 0)), clean, "median")
+    assert least["mae_mm_label"] == pytest.approx(1e3 * clean.depth_m.mean(), rel=1e-5)
 
 
 @pytest.mark.parametrize(
