@@ -26,7 +26,8 @@ class Comparison(NamedTuple):
     covered    share of bins under FULL_BIN counts inside their 95 % interval; `pit` share of their randomised
                probability integral transforms inside 2.5 to 97.5 %
     deviance   Poisson, a bin
-    model_error  relative, of bins from FULL_BIN on: the root mean square of (n - e) / e, photon noise taken out
+    excess     of bins from FULL_BIN on: the mean square of (n - e) / e, photon noise taken out, so that it may be
+               below 0
     """
 
     shape: np.ndarray
@@ -36,7 +37,16 @@ class Comparison(NamedTuple):
     covered: np.ndarray
     pit: np.ndarray
     deviance: np.ndarray
-    model_error: np.ndarray
+    excess: np.ndarray
+
+    @property
+    def model_error(self) -> float:
+        """Return the relative error of the model in bins from FULL_BIN on, of all captures and zones together; NaN
+        without such bins.
+
+        The root of the mean: of each by itself it would be above 0 by chance alone, and never below.
+        """
+        return float(np.sqrt(max(float(np.nanmean(self.excess)), 0.0)))
 
 
 def compare(counts: np.ndarray, expected: np.ndarray, bin_width_s: float, seed: int = 0) -> Comparison:
@@ -62,7 +72,7 @@ def compare(counts: np.ndarray, expected: np.ndarray, bin_width_s: float, seed: 
         _mean_where(inside, few),
         _mean_where((place >= 0.025) & (place <= 0.975), few),
         np.array(deviances),
-        np.sqrt(np.maximum(_mean_where(excess, ~few), 0.0)),
+        _mean_where(excess, ~few),
     )
 
 
@@ -107,5 +117,5 @@ def summary(of: Comparison, which: np.ndarray) -> JsonObject:
         "covered": float(np.nanmean(chosen.covered)),
         "pit_covered": float(np.nanmean(chosen.pit)),
         "deviance": float(chosen.deviance.mean()),
-        "model_error": float(np.sqrt(np.nanmean(chosen.model_error**2))),
+        "model_error": chosen.model_error,
     }
