@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
 from typing import TypeVar
@@ -271,14 +271,16 @@ def _places(detected: Detections, sensor: Sensor) -> np.ndarray:
 
 
 def _check_crosstalk_events(exposure: Exposure) -> None:
-    """Raise InputError where the detections that crosstalk is drawn from would be too many to hold.
+    """Raise InputError where the photons that crosstalk is drawn from would be too many to hold.
 
-    A law that draws a block's photons at once holds those too, detected or not.
+    A law that draws a block's photons at once holds those of a block, and of the image what it detects; one that does
+    not holds all of them, as crosstalk may let the detector see others.
     """
     primaries = exposure.whole.signal_per_pixel() + exposure.whole.background
-    expected = float(exposure.law.expected(primaries, exposure.sensor).sum())
+    expected = float(primaries.sum())
     if exposure.law.by_bins:
-        expected = max(expected, *(float(primaries[block].sum()) for block in exposure.blocks))
+        detected = float(exposure.law.expected(primaries, exposure.sensor).sum())
+        expected = max(detected, *(float(primaries[block].sum()) for block in exposure.blocks))
     if expected > MAX_CROSSTALK_EVENTS:
         raise InputError(
             f"crosstalk event by event: {expected:.3g} events would be held at once, the limit is "
@@ -297,15 +299,18 @@ def _with_crosstalk(exposure: Exposure, ready: np.ndarray, meter: Meter) -> Iter
     everything, before = [], ready.copy()
     for block in exposure.blocks:
         rng, light = exposure.rng(Stream.SENSE, block), exposure.light(block)
+        # without dead time: a photon that it hides may be seen where crosstalk comes before what hides it
+        light = light._replace(sensor=replace(light.sensor, dead_time_s=0.0))
         drawn, pieces = exposure.law.detect(light, rng, before[block]), exposure.law.pieces(light)
         parts = list(meter.count(drawn, pieces, light.flux.pixels))
         everything += [part._replace(pixel=part.pixel + block.start) for part in parts]
     events = Detections(*(np.concatenate(columns) for columns in zip(*everything, strict=True)))
     rng = exposure.rng(Stream.CROSSTALK, slice(0, 0))
-    cause, pixel = crosstalk_events(events.pixel, sensor.crosstalk, transient.height, transient.width, rng)
+    alone = exposure.law.keep(events, sensor, ready.copy())
+    cause, pixel = crosstalk_events(alone.pixel, sensor.crosstalk, transient.height, transient.width, rng)
     seen = exposure.rates.alive.ravel()[pixel] > 0  # dead pixels detect no crosstalk either
     cause, pixel = cause[seen], pixel[seen]
-    fired = Detections(pixel, events.cycle[cause], events.position[cause])
+    fired = Detections(pixel, alone.cycle[cause], alone.position[cause])
     both = Detections(*(np.concatenate(columns) for columns in zip(events, fired, strict=True)))
     detected = exposure.finished(exposure.law.keep(both, sensor, ready), 0, rng)
     places = np.sort(detected.pixel * np.int64(sensor.bins) + detected.position.astype(np.int64))

@@ -94,7 +94,7 @@ def live_detections(pixel: np.ndarray, time: np.ndarray, dead: float, ready: np.
         return order
     where, when = pixel[order], time[order]
     span = float(when.max()) + 2 * dead + 1  # more than a dead time between pixels
-    together = max(1, int(2.0**37 / span))
+    together = max(1, min(len(ready), int(2.0**37 / span)))  # pixels are counted in 32 bits
     cuts = [0, *(np.flatnonzero(np.diff(where // together)) + 1), len(where)]
     detected = np.concatenate([_live(where[a:b] % together, when[a:b], dead, span) for a, b in pairwise(cuts)])
     last = np.flatnonzero(detected)
