@@ -179,6 +179,16 @@ def test_an_exported_frame_comes_back_with_its_sensor(name, tmp_path):
     assert read_mat(tmp_path / "f.mat").sensor.pulse == Sensor().pulse
 
 
+@pytest.mark.parametrize("bins", [2, 16])
+def test_a_frame_of_few_bins_is_read_back(bins, tmp_path):
+    """Too few bins for the taps of the pulse that published frames have: the frame's pulse is another one."""
+    sensor = Sensor(bins=bins, bin_width_s=50e-12, pulse=Pulse(5e-12))
+    histogram = Histogram.from_counts(np.arange(6 * bins).reshape(2, 3, bins), sensor)
+    write_mat(histogram, tmp_path / "few.mat")
+    again = read_mat(tmp_path / "few.mat")
+    assert np.array_equal(again.counts, histogram.counts) and again.sensor.pulse.std_s < 50e-12
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
