@@ -68,9 +68,10 @@ class DetectionLaw(ABC):
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
         """Return those of given events, photons and crosstalk, that are detected."""
 
-    @abstractmethod
     def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
-        """Return about how many of so many primary detections a pixel and exposure are detected, (P,) -> (P,)."""
+        """Return about how many of so many primary detections a pixel and exposure crosstalk is drawn beside, (P,) ->
+        (P,): all, where crosstalk may let the detector see any of them."""
+        return primaries
 
     def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator, moved: Moved | None = None) -> np.ndarray:
         """Draw counts (P, T) from expected primary detections of an exposure of `cycles`.
@@ -92,10 +93,6 @@ class Poisson(DetectionLaw):
     def keep(self, events: Detections, sensor: Sensor, ready: np.ndarray) -> Detections:
         """Return all events."""
         return events
-
-    def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
-        """Return all."""
-        return primaries
 
     def counts(self, rate: np.ndarray, cycles: int, rng: np.random.Generator, moved: Moved | None = None) -> np.ndarray:
         """Draw n_i ~ Poisson(lambda_i) in every bin; the rates hold all jitter."""
@@ -150,10 +147,6 @@ class FreeRunning(DetectionLaw):
         time = events.cycle * float(sensor.bins_per_period) + events.position
         kept = live_detections(events.pixel, time, sensor.dead_time_s / sensor.bin_width_s, ready)
         return Detections(*(column[kept] for column in events))
-
-    def expected(self, primaries: np.ndarray, sensor: Sensor) -> np.ndarray:
-        """Return what a dead time leaves of photons that are uniform in time: each detection takes one of it."""
-        return primaries / (1 + primaries * sensor.dead_time_s / sensor.exposure_s)
 
 
 LAWS: dict[str, DetectionLaw] = {law.name: law for law in (Poisson(), FirstPhoton(), FreeRunning())}

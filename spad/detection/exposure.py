@@ -273,14 +273,12 @@ def _places(detected: Detections, sensor: Sensor) -> np.ndarray:
 def _check_crosstalk_events(exposure: Exposure) -> None:
     """Raise InputError where the photons that crosstalk is drawn from would be too many to hold.
 
-    A law that draws a block's photons at once holds those of a block, and of the image what it detects; one that does
-    not holds all of them, as crosstalk may let the detector see others.
+    A law that draws a block's photons at once holds those too, detected or not.
     """
     primaries = exposure.whole.signal_per_pixel() + exposure.whole.background
-    expected = float(primaries.sum())
+    expected = float(exposure.law.expected(primaries, exposure.sensor).sum())
     if exposure.law.by_bins:
-        detected = float(exposure.law.expected(primaries, exposure.sensor).sum())
-        expected = max(detected, *(float(primaries[block].sum()) for block in exposure.blocks))
+        expected = max(expected, *(float(primaries[block].sum()) for block in exposure.blocks))
     if expected > MAX_CROSSTALK_EVENTS:
         raise InputError(
             f"crosstalk event by event: {expected:.3g} events would be held at once, the limit is "
