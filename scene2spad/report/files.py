@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import struct
 import time
@@ -17,6 +16,7 @@ from PIL import Image, UnidentifiedImageError
 from scene2spad.studies.every import TIMINGS
 from scene2spad.studies.records import ENDING, read_record
 from scenes.errors import InputError, printable, require
+from scenes.files import read_csv
 from scenes.io.inputs import read_json_object
 
 # What studies keep for themselves, in their folder or in their preset's: renders, sets, captures, kept results, models.
@@ -33,7 +33,7 @@ CONFIGURATIONS: dict[str, tuple[str, tuple[str, ...]]] = {
 }  # fmt: skip
 # what readers of tables, JSON and pictures raise for damaged files
 UNREADABLE = (
-    OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, csv.Error, struct.error, zlib.error,
+    OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, struct.error, zlib.error,
     Image.DecompressionBombError,
 )  # fmt: skip
 
@@ -77,8 +77,9 @@ class Found:
             self.problem(f"{path.relative_to(self.root)}: is no picture")
             return None
         except UNREADABLE as error:
-            message = " ".join(str(error).split())[:120]
-            self.problem(f"{path.relative_to(self.root)}: cannot be read ({type(error).__name__}: {message})")
+            of = "" if isinstance(error, InputError) else f"{type(error).__name__}: "  # one says why in plain words
+            message = " ".join(str(error).split()).removeprefix(f"{path}: ")[:120]
+            self.problem(f"{path.relative_to(self.root)}: cannot be read ({of}{message})")
             return None
 
     def problem(self, line: str) -> None:
@@ -160,12 +161,8 @@ def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
 
 
 def read_rows(path: Path) -> list[dict[str, int | float | str]]:
-    """Return rows of a table; ValueError where lines are cut."""
-    with path.open(newline="", encoding="utf-8") as lines:
-        rows = list(csv.DictReader(lines, strict=True))
-    if any(None in row or None in row.values() for row in rows):
-        raise ValueError("rows of other lengths than its head")
-    return [{key: _number(text) for key, text in row.items()} for row in rows]
+    """Return rows of a table, with its numbers as such; InputError where it is none, or lines are cut."""
+    return [{key: _number(text) for key, text in row.items()} for row in read_csv(path)]
 
 
 def _number(text: str) -> int | float | str:

@@ -312,6 +312,7 @@ def test_means_of_every_evaluation_are_shown_with_their_places(tree, capfd):
     put(tree / "evaluate/far/evaluation.csv", head + lines[0] + "\n", age=9)
     put(tree / "evaluate/far/evaluation.json", json.dumps({"offset_m": 7.0, "decoder": "median", "tile": [4, 4]}))
     put(tree / "evaluate/other/evaluation.csv", "method,mae_mm\nargmax,3\n")
+    put(tree / "evaluate/cut/evaluation.csv", "method,mae_mm\nargmax\n")
     message, text = made(tree, capfd)
     part = Page(text[text.index('<section id="evaluate"') :].partition("</section>")[0])
     assert "method MAE [mm] MAE of mixed pixels [mm] RMSE [mm] within 10 mm [%] SSIM" in part.words
@@ -322,6 +323,7 @@ def test_means_of_every_evaluation_are_shown_with_their_places(tree, capfd):
     assert f"1 view at 1 photon level; {of} (evaluate/far/evaluation.csv" in part.words
     assert "not shown" not in part.words and "evaluation.json" not in text
     assert any(line.startswith("evaluate/other/evaluation.csv: cannot be read") for line in message["problems"])
+    assert any("cut/evaluation.csv: cannot be read (row 1 is of another" in line for line in message["problems"])
 
 
 def test_mistakes_end_in_one_line(tree, tmp_path, capfd):
