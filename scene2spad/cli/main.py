@@ -129,8 +129,10 @@ def _module_of(name: str) -> ModuleType:
 
 def _check_text(argv: list[str]) -> None:
     """Raise InputError for a word that is no text in this locale, as names of files may be: not every library takes
-    such names."""
+    such names. So for an empty one: as a file it would be the current folder."""
     for word in argv:
+        empty = not word or (word.startswith("--") and word.endswith("="))
+        require(not empty, f"{word or repr(word)} is empty, expected a value; is a variable of the shell unset?")
         cure = f"is no {sys.getfilesystemencoding()} text; rename the file, or set a locale that has its letters"
         require(word.encode("utf-8", "ignore").decode() == word, f"{word}: {cure}")
 

@@ -30,9 +30,7 @@ PDF_FIGURE = Mark("figure", lambda path: begins(path, rb"%PDF") and _is_undated_
 
 def input_file(path: Path) -> Path:
     if not path.is_file():
-        raise InputError(
-            f"{path}: {'is a folder, expected a file' if path.is_dir() and path.name else 'file not found'}"
-        )
+        raise InputError(f"{path}: {'is a folder, expected a file' if path.is_dir() else 'file not found'}")
     return path
 
 

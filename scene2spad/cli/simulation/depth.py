@@ -32,6 +32,7 @@ SENSING = ("sensor", "signal", "background")  # options of a transient alone
 Code = Literal["fourier", "gray", "coarse", "hadamard", "random", "fourier-published", "gray-published"]
 MEANS = ("mae_mm", "rmse_mm", "within_10mm")  # over the views of a folder
 COUNTS = ("pixels", "empty", "beyond_range", "missing")
+MAX_CODES = 9999  # by a method's name, fourier-9999
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,6 +278,8 @@ def _check_codes(command: Depth) -> None:
     require(known, f"--codes-file {command.codes_file}: expected codes (K, T) in a .npy file, or a .txt of `export`")
     only_for(command, "depth", dict.fromkeys(("code", "codes", "codes_file"), (compressive, purpose)))
     only_for(command, "depth", dict.fromkeys(("code", "codes"), (not own, f"{purpose} without --codes-file")))
+    good = command.codes is None or 1 <= command.codes <= MAX_CODES
+    require(good, f"depth: --codes {command.codes} is outside 1 to {MAX_CODES}")
 
 
 def _check_model(command: Depth) -> None:
