@@ -10,6 +10,8 @@ from render.transient import read_transient
 from scene2spad.cli import main
 from scene2spad.cli.results.inspect import BARS, WIDTH, drawn
 from spad.formats.dense import dense, write_dense
+from spad.formats.depth_map import read_depth
+from spad.formats.mat import write_mat
 from spad.measurements.histogram import Histogram, read_histogram, write_histogram
 from spad.sensor.model import Sensor
 
@@ -54,6 +56,28 @@ def test_a_histogram_and_the_counts_of_a_pixel(files, capfd):
     for one in found["pixel"]["counts"]:
         counts[one["bin"]] = one["counts"]
     assert np.array_equal(counts, histogram.counts[5, 7]) and found["pixel"]["detections"] == counts.sum()
+
+
+def test_a_depth_map_and_a_pixel_of_it(files, capfd, tmp_path):
+    out = tmp_path / "map.exr"
+    assert main(["depth", str(files / "gallery.h5"), "--out", str(out), "--no-figure"]) == 0
+    found, (depth_m, confidence, _) = message(capfd, out, "--pixel", 5, 7), read_depth(out)
+    assert (found["kind"], found["method"], found["rows"], found["columns"]) == ("depth", "log-matched", 12, 16)
+    assert found["depth_m"] == [depth_m.min(), depth_m.max()] and found["missing"] == 0
+    assert found["confidence"] == pytest.approx(confidence.mean())
+    assert (found["pixel"]["depth_m"], found["pixel"]["confidence"]) == (depth_m[5, 7], confidence[5, 7])
+    assert main(["inspect", str(out), "--pixel", "5", "7"]) == 0
+    assert f"row 5, column 7, depth_m {depth_m[5, 7]:.6g}" in capfd.readouterr().out
+
+
+def test_a_published_frame_is_inspected_as_a_histogram(files, capfd, tmp_path):
+    write_mat(read_histogram(files / "gallery.h5"), tmp_path / "frame.mat")
+    found, ours = message(capfd, tmp_path / "frame.mat", "--pixel", 5, 7), message(capfd, files / "gallery.h5")
+    assert (found["kind"], found["bins"]) == ("histogram", 1024)
+    assert found["detections_per_pixel"] == ours["detections_per_pixel"] and found["pixel"]["detections"] > 0
+    assert main(["inspect", str(tmp_path / "frame.mat"), "--frame", "1"]) == 2
+    assert main(["inspect", str(files / "gallery.exr"), "--frame", "1"]) == 2
+    assert "gallery.exr: --frame 1 is for captures (.mat)" in capfd.readouterr().err
 
 
 def test_counts_of_ones_own_were_not_asked_for(files, capfd, tmp_path):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from scene2spad.cli.opening import open_depth, open_histogram
 from scene2spad.cli.paths import holds_kind, input_file
 from scene2spad.options.common import Common, GivenFile, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from spad.measurements.histogram import Histogram
 
 log = logging.getLogger("scene2spad")
-KINDS = {".exr": ("transient",), **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack"))}
+KINDS = {".exr": ("transient", "depth"), **dict.fromkeys(HDF5_SUFFIXES, ("histogram", "pack"))}
 DENSE_SUFFIXES = (".npz", *HDF5_SUFFIXES)
 RANGES = {"path_m", "depth_m", "ambient_W_per_m2_sr_nm"}
 MAX_LINES = 40  # of a pixel's table
@@ -33,8 +34,8 @@ WIDTH = 64  # characters of a drawn histogram
 @dataclass(frozen=True, kw_only=True)
 class Inspect(Common):
     """Say what is in a file: kind, shape, units, sensor, seed, plan and ranges; with --pixel also that pixel's returns
-    or counts. FILE is a transient (.exr of render), a histogram (.h5 of sense), a pack of a set (.h5 of dataset) or
-    dense arrays (.npz, .h5 of export)."""
+    or counts. FILE is a transient (.exr of render), a histogram (.h5 of sense), a depth map (.exr of depth), a pack of
+    a set (.h5 of dataset), dense arrays (.npz, .h5 of export), or a frame or capture of the published family (.mat)."""
 
     file: Positional[GivenFile]
     """The file."""
@@ -42,21 +43,22 @@ class Inspect(Common):
     """Row and column of one pixel, both from 0, row 0 on top."""
     view: int = 0
     """View of a pack, from 0."""
+    frame: int = 0
+    """Frame of a capture (.mat), from 0."""
 
 
 def run(command: Inspect, progress: Progress) -> dict:
     """Describe a file, and one pixel of it."""
     path = input_file(command.file)
     kind = _kind(path)
-    only_for(command, str(path), {"view": (kind == "pack", "a pack")})
+    captures = (kind == "histogram", "captures (.mat)")
+    only_for(command, str(path), {"view": (kind == "pack", "a pack"), "frame": captures})
     if kind == "histogram":
-        from spad.measurements.histogram import read_histogram
-
-        histogram = read_histogram(path)
+        histogram = open_histogram(path, command.frame)
         found: JsonObject = {"kind": kind, **_of_histogram(histogram)}
         pixel = None if command.pixel is None else _counts_of(histogram, _checked(command, histogram.depth_m.shape))
-    elif kind == "dense":
-        found, pixel = _dense(command, path)
+    elif kind in ("dense", "depth"):
+        found, pixel = (_dense if kind == "dense" else _depth)(command, path)
     else:
         found, transient = _transient(command, path, kind)
         shape = (transient.height, transient.width)
@@ -69,6 +71,8 @@ def run(command: Inspect, progress: Progress) -> dict:
 
 
 def _kind(path: Path) -> str:
+    if path.suffix.lower() == ".mat":
+        return "histogram"
     known = KINDS.get(path.suffix.lower(), ())
     kind = next((kind for kind in known if holds_kind(path, kind)), None)
     if kind is not None:
@@ -78,8 +82,8 @@ def _kind(path: Path) -> str:
 
         if is_dense(path):
             return "dense"
-    expected = "a transient (.exr), a histogram (.h5), a pack (.h5) or dense arrays (.npz, .h5) of scene2spad"
-    raise InputError(f"{path}: expected {expected}")
+    expected = "a transient or depth map (.exr), a histogram or pack (.h5), a frame (.mat) or dense arrays (.npz, .h5)"
+    raise InputError(f"{path}: expected {expected}; `show` knows more kinds")
 
 
 def _dense(command: Inspect, path: Path) -> tuple[JsonObject, JsonObject | None]:
@@ -93,6 +97,27 @@ def _dense(command: Inspect, path: Path) -> tuple[JsonObject, JsonObject | None]
         return found, None
     pixel = _checked(command, arrays["depth_m"].shape)
     return found, pixel_of_dense(arrays, pixel) | {"drawn": drawn(arrays["data"][pixel])}
+
+
+def _depth(command: Inspect, path: Path) -> tuple[JsonObject, JsonObject | None]:
+    """Describe a depth map, and the pixel asked for."""
+    map_ = open_depth(path)
+    depth_m, confidence = map_.depth_m, map_.confidence
+    known = np.isfinite(depth_m)
+    found: JsonObject = {
+        "kind": "depth",
+        **_known(map_.meta, ("method", "decoder", "int8_rule")),
+        "rows": depth_m.shape[0],
+        "columns": depth_m.shape[1],
+        "depth_m": _range(depth_m),
+        "missing": int((~known).sum()),
+        "confidence": None if confidence is None or not known.any() else float(np.mean(confidence[known])),
+    }
+    if command.pixel is None:
+        return found, None
+    row, column = pixel = _checked(command, depth_m.shape)
+    sure = None if confidence is None else _number(confidence[pixel])
+    return found, {"row": row, "column": column, "depth_m": _number(depth_m[pixel]), "confidence": sure}
 
 
 def _transient(command: Inspect, path: Path, kind: str) -> tuple[JsonObject, Transient]:
@@ -218,7 +243,7 @@ def _as_text(pixel: JsonObject) -> list[str]:
     lines = [", ".join(f"{name} {_value(value)}" for name, value in pixel.items() if name not in (table, "drawn"))]
     if "drawn" in pixel:
         lines.append(f"|{pixel['drawn']}| bins from first to last")
-    rows = pixel[table]
+    rows = pixel.get(table, ())
     lines += [", ".join(f"{name} {_value(value)}" for name, value in row.items()) for row in rows[:MAX_LINES]]
     if len(rows) > MAX_LINES:
         lines.append(f"{len(rows) - MAX_LINES} more: --json gives all")
