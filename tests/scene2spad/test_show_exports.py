@@ -194,7 +194,7 @@ def test_files_of_others_are_refused_in_one_line(tmp_path, capfd):
 def test_what_is_not_exported_says_so(capfd):
     for name, kind in (("cloud.ply", "cloud"), ("codes.txt", "text")):
         assert main(["export", name, "--out", "x.npz"]) == 2
-        assert f"{name}: a {kind} is not exported" in capfd.readouterr().err
+        assert f"{name}: is of kind {kind}, which is not exported" in capfd.readouterr().err
 
 
 def test_every_dataset_of_our_hdf5_files_says_its_unit_and_what_it_is(tmp_path):

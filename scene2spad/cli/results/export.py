@@ -81,8 +81,8 @@ def run(command: Export, progress: Progress) -> dict:
     all_forms = (".npz", ".h5", ".ply")
     wanted = {"codes": CODES, "network": CODES, "depth": (".ply",), "transient": all_forms, "pack": all_forms}
     wanted["histogram"] = all_forms
-    require(kind in wanted, f"{path}: a {kind} is not exported")
-    raise InputError(f"{out}: a {kind} goes to {', '.join(wanted[kind])}")
+    require(kind in wanted, f"{path}: is of kind {kind}, which is not exported")
+    raise InputError(f"{out}: a file of kind {kind} goes to {', '.join(wanted[kind])}")
 
 
 def _exports() -> ModuleType:
@@ -145,8 +145,11 @@ def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.nd
         sure = np.ones_like(found.depth_m) if found.confidence is None else found.confidence
         bright = np.ones_like(found.depth_m)
         if command.intensity is not None:
-            bright = open_histogram(command.intensity).counts.sum(axis=2, dtype=np.int64).astype(np.float32)
+            histogram = open_histogram(command.intensity)
+            bright = histogram.counts.sum(axis=2, dtype=np.int64).astype(np.float32)
             require(bright.shape == found.depth_m.shape, f"{command.intensity}: is of another size than {command.file}")
+            if found.meta.get("histogram_sha256") != histogram.sha256():
+                log.warning("warning: %s: not the histogram that %s was made from", command.intensity, command.file)
         return found.depth_m, bright, sure, found.meta
     if kind == "histogram":
         from spad.estimators.bistatic import pointing_of

@@ -226,7 +226,7 @@ def _picture(command: Show, kind: str, out: Path) -> Path:
         from scene2spad.studies.tensors import draw
 
         return draw([open_coding(path, kind)], out)
-    raise InputError(f"{path}: a {kind} has no picture; write a page (.html)")
+    raise InputError(f"{path}: is of kind {kind}, which has no picture; write a page (.html)")
 
 
 def _histogram_figure(command: Show, out: Path) -> Path:
@@ -252,4 +252,4 @@ def _cube(command: Show, kind: str) -> Cube:
         return sources.light_over_path(open_transient(path, kind, command.view))
     if kind == "histogram":
         return sources.detections(open_histogram(path, command.frame))
-    raise InputError(f"{path}: a {kind} has nothing to play; expected a transient, a pack or a histogram")
+    raise InputError(f"{path}: is of kind {kind}, which has nothing to play; expected a transient, a pack or a histogram")
