@@ -76,7 +76,10 @@ def run(command: Dataset, progress: Progress) -> dict:
     if command.scheduler is not None:
         check_address(command.scheduler)
     check_indirect(command, "dataset", command.bounces, ("spp", "filter"))
-    only_for(command, "dataset", {"ambient_spp": (command.ambient, "ambient light (no --no-ambient)")})
+    purposes = {"ambient_spp": (command.ambient, "ambient light (no --no-ambient)")}
+    purposes |= {"offset_mode": (command.offset != 0, "scenes that are moved (--offset)")}
+    purposes |= {"workers": (command.scheduler is None, "processes of this machine (no --scheduler)")}
+    only_for(command, "dataset", purposes)
     of = scene_set(command.set)
     error = (0.01 if command.bounces == 1 else 0.03) if command.error is None else command.error
     job = Job(
