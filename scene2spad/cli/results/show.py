@@ -252,4 +252,4 @@ def _cube(command: Show, kind: str) -> Cube:
         return sources.light_over_path(open_transient(path, kind, command.view))
     if kind == "histogram":
         return sources.detections(open_histogram(path, command.frame))
-    raise InputError(f"{path}: is of kind {kind}, which has nothing to play; expected a transient, a pack or a histogram")
+    raise InputError(f"{path}: is of kind {kind}, which has nothing to play; expected a transient, pack or histogram")
