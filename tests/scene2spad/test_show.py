@@ -289,6 +289,14 @@ def test_points_lie_at_their_depth(capfd):
     assert np.array_equal(layers["confidence"], sure.ravel(), equal_nan=True)
 
 
+def test_an_intensity_of_another_histogram_is_warned_of(capfd):
+    argv = ["export", "depth.exr", "--out", "lit.ply", "--intensity"]
+    assert main([*argv, "gallery.h5"]) == 0 and "not the histogram" not in capfd.readouterr().err
+    assert main(["sense", "gallery.exr", "--seed", "1", "--out", "others.h5", "--no-figure"]) == 0
+    assert main([*argv, "others.h5"]) == 0
+    assert "warning: others.h5: not the histogram that depth.exr was made from" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("int8", [False, True])
 def test_code_tables_hold_the_tensor(int8, capfd):
     told(capfd, "export", MODEL, "--out", "codes.txt", *(["--int8"] if int8 else []))
