@@ -96,6 +96,7 @@ def refused(capfd, argv: list[str]) -> str:
         ("dataset rooms --count 1 --width 8 --height 8 --error 0 --out s", "error 0"),
         ("dataset rooms --bounces 1 --spp 4 --out s", "dataset: --spp 4 is for indirect light (--bounces above 1)"),
         ("dataset rooms --bounces 1 --filter --out s", "dataset: --filter is for indirect light"),
+        ("ultraphase list fourier-8 --out a.s", "a.s: .s is for sources, and a listing is none"),
         ("dataset rooms --offset-mode ray --out s", "--offset-mode ray is for scenes that are moved (--offset)"),
         ("dataset rooms --workers 2 --scheduler tcp://a:1 --out s", "--workers 2 is for processes of this machine"),
         ("render gallery --bounces 1 --spp 4", "render: --spp 4 is for indirect light"),

@@ -47,7 +47,10 @@ def run(command: Ultraphase, progress: Progress) -> dict:
         table = command.action not in ("table", "sweep") or command.out.suffix.lower() == ".csv"
         require(table, f"{command.out}: the output must end in .csv")
         check_target(command.out, Path(command.program) if needs else None)
-        keep_foreign(command.out, _WRITES[command.action])
+        kind = _WRITES[command.action]
+        named = command.out.suffix.lower() != ".s"
+        require(named, f"{command.out}: .s is for sources, and a {kind.kind} is none; take another ending, as .txt")
+        keep_foreign(command.out, kind)
     return actions[command.action](command, progress)
 
 
