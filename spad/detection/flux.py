@@ -77,20 +77,45 @@ def signal_per_bin(
     one period after the laser's emission.
     """
     first, last = int(transient.offsets[pixels.start]), int(transient.offsets[pixels.stop])
-    count, period = pixels.stop - pixels.start, sensor.bins_per_period
 
     def column(values: np.ndarray) -> Tensor:
         return torch.from_numpy(values[first:last].astype(np.float64)).to(device)
 
     near = column(transient.path_near_m) / SPEED_OF_LIGHT_M_PER_S
     length = column(transient.path_far_m) / SPEED_OF_LIGHT_M_PER_S - near
-    energy = column(transient.radiance)
     sizes = np.diff(transient.offsets[pixels.start : pixels.stop + 1])
-    owner = torch.from_numpy(np.repeat(np.arange(count), sizes)).to(device)
+    owner = torch.from_numpy(np.repeat(np.arange(len(sizes)), sizes)).to(device)
+    arrivals = Arrivals(near, length, column(transient.radiance), owner)
+    return arrivals_per_bin(arrivals, sensor, len(sizes), _edges_of(sensor, converter, device))
+
+
+class Arrivals(NamedTuple):
+    """Light that arrives evenly over intervals of time, (N,) tensors on one device.
+
+    near_s     begin after the laser's emission [s], float64
+    length_s   length [s], float64
+    energy     light, float64
+    owner      the pixel that it falls into, int64
+    """
+
+    near_s: Tensor
+    length_s: Tensor
+    energy: Tensor
+    owner: Tensor
+
+
+def arrivals_per_bin(
+    arrivals: Arrivals, sensor: Sensor, count: int, edges: _Edges | None = None
+) -> tuple[Tensor, float]:
+    """Return the light of `count` pixels in every bin, (count, T) float64, and how much of it wrapped.
+
+    Special functions are computed for those edges alone that lie within the pulse's reach of an arrival.
+    """
+    near, length, energy, owner = arrivals
+    device, period = near.device, sensor.bins_per_period
     width, (before, after) = sensor.bin_width_s, sensor.response.window_s(WINDOW_SIGMAS)
     start = torch.floor((near - before) / width).long()
     bins = torch.ceil((near + length + after) / width).long() - start
-    edges = _edges_of(sensor, converter, device)
     if edges is not None:
         start, bins = start - edges.reach, bins + 2 * edges.reach
     # rows of equal length make a dense table; rounding lengths up only adds bins in which nothing arrives

@@ -10,11 +10,12 @@ import numpy as np
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
+from spad.detection.saturation import saturated
 from spad.measurements.histogram import Histogram
 from spad.sensor.arrival import wrap_line
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.zone_array import ZoneArray
-from spad.zones.simulation import ZoneReturns, draw_zone_counts, expected_zone_counts, zone_returns, zone_signal
+from spad.zones.simulation import ZoneReturns, draw_flux, zone_returns, zone_signal
 
 PULSE_ENDS = 1e-11  # share of a pulse beyond its reach: as much of the light in the record is none of it
 
@@ -53,11 +54,12 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
     """
     rows, columns, order = zone_grid(zones)
     returns = zone_returns(transient, zones)
-    counts = draw_zone_counts(returns, sensor, zones, seed=seed)
-    signal = zone_signal(returns, sensor, zones).sum(axis=1)
-    background = np.asarray(zones.background) * sensor.bins
+    binned = zone_signal(returns, sensor, zones)  # once: it takes nearly all of the time
+    flux = binned + np.asarray(zones.background)[:, None]
+    counts = draw_flux(flux, zones, seed)
+    signal, background = binned.sum(axis=1), np.asarray(zones.background) * sensor.bins
     primary = signal + background
-    lost = 1 - expected_zone_counts(returns, sensor, zones).sum() / max(1e-30, float(primary.sum()))
+    lost = 1 - saturated(flux, *zones.saturation).sum() / max(1e-30, float(primary.sum()))
     reasons = [f"zones: {zones.count} fields of view", *_beside_image(transient, zones)]
     if lost > 1e-9:  # beyond rounding
         reasons[0] += f", {lost:.1%} of the detections lost to saturation"

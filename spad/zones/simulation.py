@@ -177,22 +177,11 @@ def _binned(measured: ZoneReturns, sensor: Sensor) -> np.ndarray:
     """
     import torch  # takes a second, and sensors of pixels need none of it
 
-    from spad.detection.flux import interval_cdf
+    from spad.detection.flux import Arrivals, arrivals_per_bin
 
-    start_s, end_s, light = measured
-    if not len(light):
-        return np.zeros(sensor.bins)
-    start, length = (torch.from_numpy(value)[:, None] for value in (start_s, end_s - start_s))
-    edges = torch.arange(sensor.bins + 1, dtype=torch.float64) * sensor.bin_width_s
-    reach_s = sensor.response.reach_s
-    first = math.floor((start_s.min() - reach_s) / sensor.period_s)
-    last = math.floor((end_s.max() + reach_s) / sensor.period_s)
-    counted = np.zeros(sensor.bins)
-    for cycle in range(first, last + 1):
-        after = edges + cycle * sensor.period_s - start
-        arrived = interval_cdf(sensor.response, after, length.expand(-1, len(edges)))
-        counted += np.diff(torch.from_numpy(light) @ arrived)
-    return counted
+    start_s, end_s, light = (torch.from_numpy(value) for value in measured)
+    one = torch.zeros(len(light), dtype=torch.int64)
+    return arrivals_per_bin(Arrivals(start_s, end_s - start_s, light, one), sensor, 1)[0][0].numpy()
 
 
 def zone_flux(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:
@@ -204,8 +193,7 @@ def expected_zone_counts(
     returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0
 ) -> np.ndarray:
     """Return expected counts (Z, T) float64 of one exposure, after saturation."""
-    flux = zone_flux(returns, sensor, zones, drift_s)
-    return saturated(flux, *zones.saturation)
+    return saturated(zone_flux(returns, sensor, zones, drift_s), *zones.saturation)
 
 
 def draw_zone_counts(
@@ -215,8 +203,12 @@ def draw_zone_counts(
 
     Raises InputError for a zone of more than 2^31 - 1 counts, expected or drawn.
     """
+    return draw_flux(zone_flux(returns, sensor, zones, drift_s), zones, seed)
+
+
+def draw_flux(flux: np.ndarray, zones: ZoneArray, seed: int) -> np.ndarray:
+    """Draw counts (Z, T) int64 of one exposure from expected primary detections (Z, T), as `draw_zone_counts` does."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(Stream.ZONES, 0, 0)))
-    flux = zone_flux(returns, sensor, zones, drift_s)
     trials, recovery, compression = zones.saturation
     _check_counts(saturated(flux, trials, recovery), "expected counts")
     counts = draw_saturated(flux, trials, recovery, rng, compression)
