@@ -22,7 +22,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.errors import InputError, require, require_choice, require_kind
 from scenes.files import whole_file
-from scenes.io.hdf5 import HDF5_SUFFIXES
+from scenes.io.hdf5 import HDF5_SUFFIXES, USER_BLOCK, add_checksum
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from spad.measurements.histogram import NOTES, Histogram
@@ -218,6 +218,7 @@ def write_dense(arrays: dict[str, np.ndarray], path: Path, *, layout: Layout = "
                 np.savez_compressed(file, allow_pickle=False, **arrays, **text)
         else:
             beside.write_bytes(_hdf5(arrays, layout))
+            add_checksum(beside)
     return path
 
 
@@ -230,7 +231,7 @@ def _hdf5(arrays: dict[str, np.ndarray], layout: Layout) -> bytes:
     import h5py
 
     buffer = io.BytesIO()
-    with h5py.File(buffer, "w") as file:
+    with h5py.File(buffer, "w", userblock_size=USER_BLOCK) as file:
         file.attrs["axes"] = AXES[layout]
         for name, values in arrays.items():
             packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1} if values.ndim else {}
