@@ -150,6 +150,11 @@ def _check_numbers(command: Train) -> None:
     require(command.init is None or command.init_network is None, "train: give --init or --init-network, not both")
     weights, sets = len(command.set_weights), len(command.set)
     require(weights in (0, sets), f"train: {weights} --set-weights for {sets} sets, expected one for each")
+    for option, paths in (("set", command.set), ("validation", command.validation)):
+        places = [path.resolve() for path in paths]
+        twice = next((path for path, place in zip(paths, places, strict=True) if places.count(place) > 1), None)
+        cure = "; --set-weights says how often a set is drawn from" if option == "set" else ""
+        require(twice is None, f"train: --{option} {twice} is given twice{cure}")
 
 
 def _default_network(command: Train, design: Design | None) -> Network:

@@ -33,6 +33,8 @@ DATASET = ["dataset", "rooms"]
         ([*TRAIN, "--steps", "1000000000000"], "1000000000000 steps are above 100000000"),
         ([*TRAIN, "--threads", "1000000"], "threads 1000000 is outside 0 to 1024"),
         ([*TRAIN, "--init-share", "0.5"], "--init-share needs --init"),
+        ([*TRAIN, "--set", "a.h5", "b.h5", "./a.h5"], "train: --set a.h5 is given twice; --set-weights says how often"),
+        ([*TRAIN, "--validation", "a.h5", "x/../a.h5"], "train: --validation a.h5 is given twice"),
         ([*TRAIN, "--workers", "1000000"], "workers 1000000 is outside 0 to 256"),
     ],
 )
