@@ -58,6 +58,15 @@ SMALLER_ALL = """
 from scene2spad.studies import every
 every.STUDIES = ("memory", "codes", "fourier", "tensors")
 """
+WALLS = """
+from pathlib import Path
+from render.transient.packs import write_pack
+from scene2spad.datasets.planes import wall
+if not Path("walls.h5").exists():
+    write_pack([(wall(1.0 + 0.5 * n, 48), {"scene": f"walls/{n}"}) for n in range(2)], Path("walls.h5"))
+"""
+EVALUATE = ("evaluate", "learned-256x4x4-128x-s0", "none-s0", "--set", "walls.h5", "--baselines", "argmax", "--maps")
+EVALUATE += ("--levels", "50+1", "10+10", "1+1")
 RENDER_ERROR = ("study", "render-error", "--width", "12", "--height", "8", "--views", "1")
 RUNS = {
     "dataset": Run(command("dataset", "hard-cases", *SET)),
@@ -66,6 +75,7 @@ RUNS = {
         command("dataset", "rooms", "--width", "8", "--height", "8", "--bounces", "1", "--count", "7", "--out", "out")
     ),
     "train": Run(command("train", "--preset", "smoke", "--threads", "1", "--steps", "24", "--out", "out"), UNLIKE),
+    "evaluate": Run(command(*EVALUATE, "--out", "out", before=WALLS)),
     "codes": Run(command("study", "codes", "--width", "12", "--height", "8", "--out", "out")),
     "render-error": Run(command(*RENDER_ERROR, "--out", "out/study", "--cache", "out/cache", before=SMALLER)),
     "transport": Run(command("study", "transport", *SMOKE, before=SMALLER)),

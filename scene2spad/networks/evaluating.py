@@ -23,7 +23,8 @@ from scene2spad.datasets.renders import unsure_scenes, views_at
 from scene2spad.methods import classical_method
 from scene2spad.networks.depth_maps import check_free, map_writer
 from scene2spad.networks.end_warnings import warn_of_ends
-from scene2spad.networks.training import common_tile, network_method
+from scene2spad.networks.training import common_tile
+from scene2spad.networks.unfinished import Unfinished
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
 from scenes.files import whole_file, write_csv
@@ -75,20 +76,23 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     warn_of_seen(command, [config for _, config, _ in loaded], views, whole)
     check_truth(command.set, views, sensor, command.offset)
     overflows: list[int] = []
+    unfinished = Unfinished(command.out / "unfinished")
     methods: dict[str, Method] = {}
     groups: dict[str, list[str]] = {}
     for path, model, group in zip(command.checkpoints, models, designs, strict=True):
         warn_of_ends(str(path), model.config, command.decoder)
         for suffix, int8 in (("", False), (in_8_bits, True))[: 1 + command.int8]:
             read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}
-            methods[f"{path}{suffix}"] = network_method(model, **read, overflows=overflows)
+            methods[f"{path}{suffix}"] = unfinished.method(model, overflows, **read)
             groups.setdefault(f"{group}{suffix}", []).append(f"{path}{suffix}")
     methods |= {name: classical_method(name, sensor, seed=command.seed) for name in command.baselines}
     groups |= {name: [name] for name in command.baselines}
     tile = common_tile(models) if command.tiled else (1, 1)
     plan = EvaluationPlan(levels, tile, command.offset, command.seed, command.law)
-    keep = map_writer(folder, methods) if command.maps else None
+    keep = map_writer(unfinished.maps, methods) if command.maps else None
     found = evaluate(methods, views, sensor, plan, progress=progress, keep=keep)
+    if unfinished.taken:
+        log.info("%d depth maps of networks are those of an evaluation that was stopped", unfinished.taken)
     _report_plans(found, command.law)
     _warn_of_missing(found, groups)
     command.out.mkdir(parents=True, exist_ok=True)
@@ -103,6 +107,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     conditions = _conditions(command, views, sensor, tile)
     with whole_file(table.with_suffix(".json")) as beside:
         beside.write_text(json.dumps(conditions, indent=1) + "\n")
+    unfinished.end(folder if command.maps else None)
     shown |= {"conditions": conditions} if command.json else {}
     return shown | ({"maps": str(folder)} if command.maps else {})
 

@@ -145,7 +145,8 @@ def check_used(command: Train) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Common):
-    """Trained networks beside classical estimators on a rendered set, at the paper's 16 photon levels."""
+    """Trained networks beside classical estimators on a rendered set, at the paper's 16 photon levels; a run that was
+    killed goes on: what networks have estimated lies in OUT/unfinished until it ends."""
 
     checkpoints: Positional[Annotated[tuple[Path, ...], required_word("MODEL [MODEL ...]")]]
     """Checkpoints of `train`, their folders, or names of models (see `models`); the first is the one that the others
@@ -179,6 +180,7 @@ class Evaluate(Common):
     """Rounding of weights with --int8: 255 steps over each factor's own range (default), or over -1 to 1 as
     published."""
     maps: bool = False
-    """Write all depth maps as well, without confidence: maps/METHOD/VIEW-SCENE-SIGNAL+BACKGROUND.exr below --out."""
+    """Write all depth maps as well, without confidence: maps/METHOD/VIEW-SCENE-SIGNAL+BACKGROUND.exr below --out, where
+    they stand at the end."""
     out: Path = Path("out/evaluate")
     """Folder for the table (.csv), and for what it is of (.json)."""

@@ -30,6 +30,7 @@ from render.transient import read_transient
 from render.transient.packs import read_pack
 from scenes.files import read_array, read_arrays
 from scenes.io.inputs import parse_json, read_whole_lines
+from spad.formats.depth_map import read_depth
 
 SERVER = """
 import importlib, json, os, signal, sys, traceback
@@ -182,6 +183,8 @@ def check_whole(folder: Path) -> None:
         if path.is_dir() or path.name.startswith("."):
             continue
         match path.suffix:
+            case ".exr" if "maps" in path.parts:
+                read_depth(path)
             case ".exr":
                 read_transient(path)
             case ".h5":

@@ -20,6 +20,7 @@ PUBLISHED_SET = Path("published")
 def run(command: Evaluate, progress: Progress) -> dict:
     """Run the command: checkpoints and a set -> errors."""
     output_folder(command.out, "the table")
+    output_folder(command.out / "unfinished", "what is estimated")
     twice = [name for name in command.baselines if command.baselines.count(name) > 1]
     require(not twice, f"evaluate: baseline {' '.join(twice[:1])} is named twice")
     require(bool(command.checkpoints), "evaluate: no checkpoint; MODEL [MODEL ...] comes before the options")
