@@ -14,7 +14,7 @@ from scene2spad.dry_runs.training import step_seconds
 from scene2spad.networks.lookup import OTHER_SEEDS, models_folder
 from scene2spad.networks.registry import ModelRegistry, ModelSpec
 from scene2spad.networks.training import PLANES, config_of
-from scene2spad.options.experiments import ABLATIONS, Study, trains_models
+from scene2spad.options.experiments import ABLATIONS, NO_PRESET, Study, trains_models
 from scene2spad.options.networks import TrainingPreset
 from scene2spad.studies.every import TIMINGS
 from scenes.io.inputs import read_whole_lines
@@ -32,16 +32,18 @@ def dry_run(command: Study) -> dict:
     to_train = missing if trains else []
     training_s = sum(_training_seconds(one, command.preset) for one in to_train)
     earlier = recorded_seconds(command)
+    of_preset = "" if command.name in NO_PRESET else " of this preset"
     basis = []
     if earlier:
-        basis.append(f"the median of {len(earlier)} finished runs of this preset in {command.out}")
+        basis.append(f"the median of {len(earlier)} finished runs{of_preset} in {command.out}")
     if to_train:
         basis.append(f"{len(to_train)} trainings by some steps of each network on random counts")
     known = bool(earlier) or bool(to_train)
+    preset = {} if command.name in NO_PRESET else {"preset": command.preset}
     return {
         "dry_run": True,
         "study": command.name,
-        "preset": command.preset,
+        **preset,
         "models": {
             "there": [*(one.name for one in (*there, *beside)), *given],
             "to_train": [one.name for one in to_train],
@@ -50,7 +52,7 @@ def dry_run(command: Study) -> dict:
         "kept": {"results": _lines(folder / "results"), "rendered_views": _views(folder / "sets")},
         "memory": memory(None),
         "estimate": {"seconds": (median(earlier) if earlier else training_s) if known else None},
-        "basis": "; ".join(basis) or "unknown: no run of this preset has been recorded here",
+        "basis": "; ".join(basis) or f"unknown: no run{of_preset} has been recorded here",
         "out": str(command.out),
     }
 
@@ -109,12 +111,12 @@ def wanted_models(command: Study) -> list[ModelSpec]:
 
 
 def recorded_seconds(command: Study) -> list[float]:
-    """Return the seconds of finished runs of this study and preset into this folder."""
+    """Return the seconds of finished runs of this study, and preset where it has some, into this folder."""
     found = []
     for line in read_whole_lines(command.out / TIMINGS):
         match line:
             case {"study": str(name), "preset": str(preset), "seconds": float(seconds) | int(seconds)}:
-                if (name, preset) == (command.name, command.preset):
+                if name == command.name and (name in NO_PRESET or preset == command.preset):
                     found.append(float(seconds))
     return found
 

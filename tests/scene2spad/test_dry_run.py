@@ -148,6 +148,11 @@ def test_a_dry_study_tells_models_and_recorded_runs(capfd, folder):
     answer(capfd, "study", "memory", "--out", "out")
     said = answer(capfd, "study", "memory", "--out", "out", "--dry-run")
     assert "median of 1 finished run" in said["basis"] and said["estimate"]["seconds"] > 0
+    # a study without presets is the same run with every one of `study all`
+    assert "preset" not in said and "preset" not in said["basis"]
+    asked = ("study", "all", "--preset", "smoke", "--out", "out", "--dry-run")
+    memory = next(one for one in answer(capfd, *asked)["studies"] if one["study"] == "memory")
+    assert "preset" not in memory and memory["estimate"]["seconds"] == said["estimate"]["seconds"]
     said = answer(capfd, "study", "all", "--dry-run")
     assert [one["study"] for one in said["studies"]] == list(STUDIES)
 
