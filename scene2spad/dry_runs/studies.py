@@ -25,6 +25,7 @@ def dry_run(command: Study) -> dict:
     that is given and is not there, and for another model under a wanted name."""
     wanted = wanted_models(command)
     folder = command.out / command.preset
+    results = (command.out if command.name == "sim-to-real" else folder) / "results"  # keyed by all that it depends on
     trains = trains_models(command.name, command)
     there, missing = _found(wanted, command, shipped=not trains)
     beside, _ = _found(models_beside(command), command, shipped=not trains)
@@ -49,7 +50,7 @@ def dry_run(command: Study) -> dict:
             "to_train": [one.name for one in to_train],
             "left_out": [one.name for one in missing if one not in to_train],
         },
-        "kept": {"results": _lines(folder / "results"), "rendered_views": _views(folder / "sets")},
+        "kept": {"results": _lines(results), "rendered_views": _views(folder / "sets")},
         "memory": memory(None),
         "estimate": {"seconds": (median(earlier) if earlier else training_s) if known else None},
         "basis": "; ".join(basis) or f"unknown: no run{of_preset} has been recorded here",

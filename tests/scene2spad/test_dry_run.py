@@ -21,6 +21,7 @@ from scene2spad.networks.registry import ModelRegistry, ModelSpec
 from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study
 from scene2spad.studies import every
 from scenes.errors import InputError
+from scenes.files import append_line
 
 
 @pytest.fixture
@@ -155,6 +156,13 @@ def test_a_dry_study_tells_models_and_recorded_runs(capfd, folder):
     assert "preset" not in memory and memory["estimate"]["seconds"] == said["estimate"]["seconds"]
     said = answer(capfd, "study", "all", "--dry-run")
     assert [one["study"] for one in said["studies"]] == list(STUDIES)
+
+
+def test_a_dry_study_counts_results_where_the_study_keeps_them(capfd, folder):
+    for study, place in (("sim-to-real", "out/results"), ("fourier", "out/laptop/results")):
+        (folder / place).mkdir(parents=True)
+        append_line(folder / place / "a.jsonl", "[1, 2]")
+        assert answer(capfd, "study", study, "--out", "out", "--dry-run")["kept"]["results"] == 1
 
 
 def test_a_dry_study_lists_what_it_would_find_and_what_it_is_given(capfd, folder):
