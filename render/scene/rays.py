@@ -240,15 +240,14 @@ def in_beam(world: TracedScene, point: Array, pixel: UInts) -> Array:
     if laser.mode == "flood":
         aim = to_camera(world, mi.Vector3f(point) - world.laser)
         return dr.atan2(dr.norm(mi.Vector2f(aim.x, aim.y)), aim.z) <= world.half_angle
-    seen_in, same = pixel_of(world, point, columns=laser.mode == "scan")
+    seen_in, same = pixel_of(world, point)
     return same & (seen_in == pixel if laser.mode == "scan" else seen_in // world.width == pixel // world.width)
 
 
-def pixel_of(world: TracedScene, point: Array, *, columns: bool = True) -> tuple[Array, Array]:
-    """Return the flat pixel in whose pyramid a point lies, and whether there is one; not in which of its row's
-    `columns` if these do not matter."""
+def pixel_of(world: TracedScene, point: Array) -> tuple[Array, Array]:
+    """Return the flat pixel in whose pyramid a point lies, and whether there is one."""
     column, row, seen = raster_of(world, world.eye, point)
-    column, row = dr.floor(column) if columns else Float(0), dr.floor(row)
+    column, row = dr.floor(column), dr.floor(row)
     inside = seen & (row >= 0) & (row < Float(world.height)) & (column >= 0) & (column < Float(world.width))
     return UInt32(dr.select(inside, row, 0)) * world.width + UInt32(dr.select(inside, column, 0)), inside
 

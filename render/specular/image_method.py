@@ -253,7 +253,8 @@ def _shines_on(
         x, y, z = ((point - laser_point) @ camera.rotation).T
         return np.arctan2(np.hypot(x, y), z) <= laser.half_angle(camera) * (1 + 1e-5)
     lit_column, lit_row = _raster(world, point)
-    return (lit_row == row) & ((lit_column == column) | (laser.mode == "line"))
+    in_image = (lit_column >= 0) & (lit_column < camera.width)
+    return (lit_row == row) & (in_image if laser.mode == "line" else lit_column == column)
 
 
 # ---- mirrored light ----

@@ -209,3 +209,16 @@ def test_few_pixels_are_named_in_large_images_only():
 def test_seeds_are_whole_numbers(seed):
     with pytest.raises(InputError, match=r"^seed \S+: expected a whole number, 0 or more$"):
         render(Scene("wall", (oracles.wall(3.0, 0.5),), oracles.camera(4, 4)), RenderSettings(bounces=1), seed=seed)
+
+
+@pytest.mark.parametrize("mode", ["line", "scan"])
+@pytest.mark.parametrize("baseline_m", [(0, 0, 0), (0.3, 0.1, 0)])
+def test_a_line_ends_where_its_row_of_the_image_does(mode, baseline_m):
+    """A wall fills the view, and white walls stand on both sides of it: these are dark, and light nothing."""
+    front = [(-1, -1, -2), (1, -1, -2), (1, 1, -2), (-1, 1, -2)]
+    left = [(-1, -2, -2), (-1, -2, 2), (-1, 2, 2), (-1, 2, -2)]
+    sides = [np.array(left, float) * (side, 1, 1) for side in (1, -1)]
+    surfaces = tuple(Surface(np.array(four, float), FACES, WALLS) for four in (front, *sides))
+    scene = Scene("sides", surfaces, looking((0, 0, 0), (0, 0, -1), 40), Laser(mode, baseline_m))
+    found = render(scene, RenderSettings(bounces=2, spp=64), seed=1)
+    assert (found.bounces == 1).any() and not (found.bounces > 1).any()
