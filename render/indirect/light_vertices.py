@@ -21,12 +21,13 @@ from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, UInts, Vectors
 from render.indirect.glossy import has_light_paths, ratio_at_laser
-from render.scene.rays import first_opaque, interaction_from_parts, laser_light, parts_of, segment, to_world
+from render.scene.rays import first_opaque, interaction_from_parts, laser_light, parts_of, segment, spawn, to_world
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 from scenes.model import Laser
 
 MAX_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
 MIN_FAR_COSINE = 1e-9
+TOUCHING = 5e-7  # of the laser's largest coordinate, from the camera: what float32 hardly tells apart
 # Light vertices that x1 is connected to, of a path alone and of one that is reused: as many as lowered the noise of a
 # second most. Under a lamp, whose paths seldom meet what is close to it, later vertices are joined to one, too. A flash
 # lights what its pixels see, which paths meet often: there joining hardly pays.
@@ -108,7 +109,11 @@ def _sample_vertices(world: TracedScene, index: UInts, each: UInts, *key: UInts)
     sine, cosine = dr.sincos(2 * math.pi * v)
     towards = to_world(world, mi.Vector3f(ring * cosine, ring * sine, 1 - height))
     ray = mi.Ray3f(mi.Point3f(world.laser) + 0 * towards, towards)
-    si, _, _, _ = first_opaque(world, ray, Bool(True))
+    si, _, _, distance = first_opaque(world, ray, Bool(True))
+    # a lamp on a wall lights the room, not the wall: shadow rays end before it, too
+    touching = si.is_valid() & (distance <= TOUCHING * dr.max(dr.abs(world.laser)))
+    beyond, _, _, _ = first_opaque(world, spawn(si, towards), touching, ray.o)
+    si = dr.select(touching, beyond, si)
     found = si.is_valid()
     to_laser, irradiance, path = laser_light(world, si, 0 * index, found, seen_by_camera=None)
     return parts_of(si), to_laser, path, irradiance, density_of(world, si, to_laser)

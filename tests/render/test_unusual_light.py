@@ -222,3 +222,13 @@ def test_a_line_ends_where_its_row_of_the_image_does(mode, baseline_m):
     scene = Scene("sides", surfaces, looking((0, 0, 0), (0, 0, -1), 40), Laser(mode, baseline_m))
     found = render(scene, RenderSettings(bounces=2, spp=64), seed=1)
     assert (found.bounces == 1).any() and not (found.bounces > 1).any()
+
+
+def test_a_lamp_on_a_wall_lights_the_room() -> None:
+    """Against plain path tracing: a lamp that lies in the ceiling's very plane shines down, and not on the ceiling."""
+    lamp = Laser(baseline_m=(0.3, -2.0, 1.2), cone_deg=360)
+    scene = Scene("ceiling", (room(),), looking((0, 0, 0), (0, 0, 1)), lamp)
+    found = render(scene, RenderSettings(bounces=3, spp=64), seed=1)
+    edges_m = np.array([0.0, 100.0])
+    direct, all_light = (path_traced(scene, edges_m, bounces=most, spp=256).sum() for most in (1, 3))
+    assert found.radiance[found.bounces > 1].sum() == pytest.approx(all_light - direct, rel=0.02)
