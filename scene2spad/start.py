@@ -8,11 +8,12 @@ import io
 import os
 import sys
 
-from scene2spad.interrupts import STOPPED, comes_of_interrupt, interrupt_again
+from scene2spad.interrupts import comes_of_interrupt, interrupt_again, stop_signals_interrupt, stopped
 
 
 def script() -> None:
-    """Run the command line and exit with its status; 130 for Ctrl-C, also while libraries are being imported."""
+    """Run the command line and exit with its status; 130 for Ctrl-C, 143 for SIGTERM and 129 for SIGHUP, also while
+    libraries are being imported."""
     _open_standard_streams()
     _check_folder()
     # Libraries make a million objects that stay: searching them for garbage is a tenth of the time of their import.
@@ -23,19 +24,18 @@ def script() -> None:
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     sys.unraisablehook = interrupt_again
     try:
+        stop_signals_interrupt()
         from scene2spad.cli import main
 
         status = main(sys.argv[1:])
         if sys.stdout is not None:
             sys.stdout.flush()
     except KeyboardInterrupt:
-        print(STOPPED, file=sys.stderr)
-        status = 130
+        status = stopped()
     except ImportError as error:
         if not comes_of_interrupt(error):
             raise
-        print(STOPPED, file=sys.stderr)
-        status = 130
+        status = stopped()
     except OSError as error:  # of --help: commands report their own files
         sys.stdout = None
         status = 0 if isinstance(error, BrokenPipeError) else 2

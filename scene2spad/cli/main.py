@@ -23,7 +23,7 @@ from typing import Annotated
 import tyro
 
 from scene2spad.cli.completion import SHELLS, completion_script
-from scene2spad.interrupts import STOPPED
+from scene2spad.interrupts import stopped
 from scene2spad.options.common import Common
 from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
@@ -92,8 +92,7 @@ def main(argv: list[str]) -> int:
             raise
         return _refuse("out of memory: use a smaller image or batch, or fewer samples")
     except KeyboardInterrupt:
-        print(STOPPED, file=sys.stderr)
-        return 130
+        return stopped()
     try:
         print(json.dumps(finite(result), allow_nan=False) if command.json else _format_result(result), flush=True)
     except BrokenPipeError:

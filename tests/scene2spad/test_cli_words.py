@@ -278,3 +278,31 @@ def test_help_names_what_a_command_takes(name, capsys):
     assert main([name, "--help"]) == 0
     usage = capsys.readouterr().out.split("\n\n")[0]
     assert not {"STR", "[STR]", "PATH", "[PATH]"} & set(usage.split()), usage
+
+
+STOPPING = """
+import os, signal, sys, tempfile, types
+from scene2spad.start import script
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job begins without
+def main(argv):
+    with tempfile.TemporaryDirectory(dir="."):
+        os.kill(os.getpid(), signal.{name})
+    return 0
+sys.modules["scene2spad.cli"] = types.SimpleNamespace(main=main)
+script()
+"""
+
+
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_signals_that_stop_a_command_let_it_clean_up_and_say_so_in_a_line(tmp_path, name, status):
+    program = [sys.executable, "-c", STOPPING.format(name=name)]
+    done = run_process(program, cwd=tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (status, 1) and "interrupted" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_that_is_ignored_stays_ignored(tmp_path):
+    """As nohup has it: the terminal may close."""
+    program = ["sh", "-c", 'trap "" HUP; exec "$@"', "sh", sys.executable, "-c", STOPPING.format(name="SIGHUP")]
+    done = run_process(program, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
