@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from numbers import Integral, Real
 from pathlib import Path
+from threading import RLock
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from spad.sensor.model import Sensor
 
 Law = Literal["auto", "poisson", "first-photon", "free-running"]
+_RENDERING = RLock()  # what Dr.Jit records belongs to all threads, and would mix
 
 
 def render(
@@ -36,13 +38,12 @@ def render(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Transient:
-    """Render the time-resolved radiance of a scene.
+    """Render the time-resolved radiance of a scene. Threads take turns.
 
     Parameters
     ----------
     scene : Scene, str or Path
-        A scene, the name of a built-in one (``scene2spad scenes`` lists them), or a file: a mesh (.obj .ply .stl .glb)
-        or a Mitsuba scene (.xml).
+        A scene, the name of a built-in one (see ``scene2spad scenes``), a mesh (.obj .ply .stl .glb) or Mitsuba's .xml.
     seed : int
         Seed of everything random. The same seed gives the same bytes.
     width, height : int, optional
@@ -79,13 +80,14 @@ def render(
     from render.settings import RenderSettings
     from scenes.model import Scene
 
-    _check_settings(settings, [field.name for field in fields(RenderSettings)])
     _check_progress(progress)
+    _check_settings(settings, [field.name for field in fields(RenderSettings)])
     if not isinstance(scene, Scene):
         scene = _loaded(str(scene), seed, width, height, placing)
     elif width is not None or height is not None or placing is not None:
         raise InputError("render: a Scene has its own camera; width, height and placing go with a name or a file")
-    return render_scene(scene, RenderSettings(**settings), seed=seed, progress=progress)
+    with _RENDERING:
+        return render_scene(scene, RenderSettings(**settings), seed=seed, progress=progress)
 
 
 def _loaded(name: str, seed: int, width: int | None, height: int | None, placing: Placing | None) -> Scene:

@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -172,3 +173,14 @@ def test_sensors_are_taken_by_name_wherever_one_is_asked_for(histogram):
     again = s2s.Histogram.from_counts(sensed.counts, "swissspad3")
     assert again.sensor == sensed.sensor and s2s.coding_tensor("gray", 8, "pf32").temporal.shape[0] == 8
     assert s2s.Histogram.from_counts(histogram.counts, histogram.sensor).sensor == histogram.sensor
+
+
+def test_scenes_render_from_several_threads_as_from_one():
+    """Dr.Jit refused to replay in one thread what another was recording."""
+
+    def rendered(seed):
+        return s2s.render("plane", width=8, height=6, bounces=1, seed=seed).sha256()
+
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(rendered, range(8)))
+    assert together == [rendered(seed) for seed in range(8)]
