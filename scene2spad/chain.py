@@ -272,6 +272,7 @@ def coding_tensor(code: str, codes: int, sensor: Sensor | str | Path = "referenc
     from csph import CodingTensor, temporal_code
     from spad.sensor.files import pixel_sensor
 
+    require_kind(code, str, "coding_tensor: code")
     chosen = pixel_sensor(sensor)
     _check_seed(seed)
     return CodingTensor(f"{code}-{codes}", temporal_code(code, codes, chosen.bins, chosen, seed))

@@ -242,7 +242,10 @@ class Histogram:
 def _checked_counts(counts: np.ndarray, bins: int) -> np.ndarray:
     """Return counts of so many bins as an array; InputError for what `Histogram.from_counts` says."""
     require(not np.ma.is_masked(counts), "histogram: counts are masked, fill them first: `counts.filled(0)`")
-    array = np.asarray(counts)
+    try:
+        array = np.asarray(counts)
+    except (ValueError, RuntimeError) as error:  # rows of several lengths, tensors that are being trained
+        raise InputError(f"histogram: counts are no array of numbers ({error})") from None
     if array.ndim != 3 or array.shape[2] != bins or array.dtype.kind not in "iufb":
         raise InputError(f"histogram: counts are {array.dtype}{array.shape}, expected (H, W, {bins})")
     require(array.size > 0, f"histogram: counts are of {array.shape[0]} x {array.shape[1]} pixels, expected 1 or more")

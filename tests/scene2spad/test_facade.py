@@ -142,6 +142,7 @@ def test_optics_compute_the_photon_budget():
         (lambda h: s2s.estimate_depth(h, "log-machted"), "log-matched"),
         (lambda h: s2s.load_model("nosuch"), "nosuch"),
         (lambda h: s2s.coding_tensor("furier", 8), "furier"),
+        (lambda h: s2s.coding_tensor(["fourier"], 8), "coding_tensor: code: expected a str, not list"),
         (lambda h: s2s.coding_tensor("random", 8, seed=None), "seed None: expected a whole number, 0 or more"),
         (lambda h: s2s.depth_errors(h.depth_m, h, unmixed="no"), "unmixed 'no', expected True or False"),
         (lambda h: s2s.sense(h), "sense: expected a Transient of `render` or `read_transient`, not Histogram"),

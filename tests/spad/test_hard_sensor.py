@@ -239,8 +239,9 @@ def test_auto_says_why() -> None:
 @pytest.mark.parametrize(
     "counts",
     [np.zeros((2, 8)), np.zeros((2, 2, 9)), np.full((1, 1, 8), -1), np.full((1, 1, 8), 0.5), np.full((1, 1, 8), np.nan)]
-    + [np.full((1, 1, 8), 2.0**31), np.full((1, 1, 8), "a")],
-    ids=["flat", "bins", "negative", "half", "nan", "large", "text"],
+    + [np.full((1, 1, 8), 2.0**31), np.full((1, 1, 8), "a")]
+    + [[[[1] * 8, [1] * 7]], torch.ones(1, 1, 8, requires_grad=True)],
+    ids=["flat", "bins", "negative", "half", "nan", "large", "text", "ragged", "trained"],
 )
 def test_measured_counts_that_are_none_are_refused(counts) -> None:
     with pytest.raises(InputError, match="counts"):
