@@ -362,7 +362,7 @@ def test_a_byte_order_mark_changes_nothing(tmp_path, marked):
 
 
 def test_a_word_in_a_normal_of_a_text_stl_is_passed_over_in_silence(tmp_path):
-    """Its normals are not used; trimesh's traceback went to stderr where nobody had set up any logging."""
+    """Keep stderr silent: normals are not used, and without a handler a traceback of trimesh went there."""
     text = trimesh.exchange.stl.export_stl_ascii(trimesh.creation.box())
     write(tmp_path / "a.stl", text.replace("facet normal ", "facet normal up", 1))
     code = "import sys; from scenes.io.mesh_formats.meshes import load_mesh; print(load_mesh(sys.argv[1]).triangles)"

@@ -41,7 +41,7 @@ def simulated(dead: float, fraction: float, seed: int) -> int:
 
 @pytest.mark.parametrize("dead", [0.5, 1.3])
 def test_a_photon_is_seen_that_only_a_detection_had_hidden_which_crosstalk_takes(dead: float) -> None:
-    """Of three photons a period crosstalk of 5 % adds about 3 % to what a dead time of half of one leaves."""
+    """Add about 3 % by crosstalk of 5 % to what half a period of dead time leaves of three photons a period."""
     fraction, bins = 0.05, 10
     sensor = Sensor(
         bins=bins, bin_width_s=1e-9, exposure_s=CYCLES * bins * 1e-9, crosstalk=fraction, dead_time_s=dead * bins * 1e-9
