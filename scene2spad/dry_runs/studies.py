@@ -13,9 +13,9 @@ from scene2spad.dry_runs.resources import memory
 from scene2spad.dry_runs.training import step_seconds
 from scene2spad.networks.lookup import OTHER_SEEDS, models_folder
 from scene2spad.networks.registry import ModelRegistry, ModelSpec
-from scene2spad.networks.training import PLANES, config_of
+from scene2spad.networks.training import config_of
 from scene2spad.options.experiments import ABLATIONS, NO_PRESET, Study, trains_models
-from scene2spad.options.networks import TrainingPreset
+from scene2spad.options.networks import PLANES, TrainingPreset
 from scene2spad.studies.every import TIMINGS
 from scenes.io.inputs import read_whole_lines
 
@@ -131,7 +131,7 @@ def _found(wanted: Sequence[ModelSpec], command: Study, *, shipped: bool) -> tup
 
 
 def _training_seconds(one: ModelSpec, preset: TrainingPreset) -> float:
-    config = config_of(one.command(preset, Path(PLANES), Path()))
+    config = config_of(one.command(preset, PLANES, Path()))
     return step_seconds(config)[0] * config.steps
 
 

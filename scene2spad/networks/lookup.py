@@ -12,8 +12,8 @@ from csph.training.views import read_views, training_parts
 from csph.weights.shipped import WEIGHTS
 from scene2spad.networks.registry import ModelRegistry, ModelSpec, Trained
 from scene2spad.networks.test_sets import rooms
-from scene2spad.networks.training import PLANES
 from scene2spad.options.experiments import Study, trains_models
+from scene2spad.options.networks import PLANES
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 
@@ -42,7 +42,7 @@ def obtain(wanted: Sequence[ModelSpec], command: Study, progress: Progress) -> M
     another configuration under a wanted name, and for a finished one that is not what is to be trained.
     """
     folder, library = command.out / command.preset, _library(command)
-    training = command.set or (Path(PLANES) if command.preset == "smoke" else None)
+    training = command.set or (PLANES if command.preset == "smoke" else None)
     found = library.gather(wanted)
     todo = [one for one in wanted if one not in found]
     if library.shipped is None:
@@ -104,7 +104,7 @@ def _check_as_asked(finished: Iterable[Trained], command: Study) -> None:
         run, preset = one.path.parent, one.config.preset
         asked = not command.retrain or preset == command.preset
         require(asked, f"{run}: was trained with --preset {preset}, not {command.preset}; give that, or other --models")
-        if command.set in (None, Path(PLANES)):
+        if command.set in (None, PLANES):
             continue
         parts = parts or training_parts(read_views(command.set))
         same = str(one.config.data.get("training_sha256")) in parts

@@ -20,7 +20,7 @@ from csph.networks.config import ModelConfig, TrainConfig
 from csph.networks.model import DepthModel, load_model, weights_sha256
 from csph.weights.shipped import RESUME, WEIGHTS, file_names, is_shipped, ship, shipped_file
 from scene2spad.networks.training import config_of, run_train
-from scene2spad.options.networks import Train, TrainingPreset
+from scene2spad.options.networks import PLANES, Train, TrainingPreset
 from scenes.errors import require
 from scenes.progress import Progress
 
@@ -196,7 +196,7 @@ def check(config: TrainConfig, wanted: ModelSpec, path: Path) -> None:
     Models to compare with the paper are each trained by a recipe of its own: some were begun with a run of another
     seed, and some keep the mean over their codes.
     """
-    expected = config_of(wanted.command("laptop", Path("planes"), Path()))
+    expected = config_of(wanted.command("laptop", PLANES, Path()))
     pairs = {
         "random time offsets [m]": (config.time_offset_m, wanted.time_offset_m),
         "seed": (config.seed, wanted.seed),

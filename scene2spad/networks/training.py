@@ -32,7 +32,7 @@ from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.workers import check_workers
 from scene2spad.methods import code_of
 from scene2spad.networks.level_warnings import level_warnings
-from scene2spad.options.networks import Train, check_used
+from scene2spad.options.networks import PLANES, Train, check_used
 from scenes.errors import InputError, require
 from scenes.progress import Progress
 from spad.estimators.depth import METHODS, estimate_depth, histogram_depth_m
@@ -42,7 +42,6 @@ from spad.sensor.model import Sensor
 
 log = logging.getLogger("scene2spad")
 
-PLANES = "planes"  # the set that needs no renderer
 PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "gpu": 4000, "paper": 13851}
 SMOKE_PIXELS = 32
 DEFAULT_COMPRESSION = 128.0
@@ -205,7 +204,7 @@ def _split(path: Path, views: Views) -> tuple[Views, Views]:
 
 
 def _views_of_set(path: Path, command: Train) -> Views:
-    if str(path) != PLANES:
+    if path != PLANES:
         return _views_of_one_size(path)
     pixels = SMOKE_PIXELS if command.preset == "smoke" else 64
     return random_planes(PLANE_SCENES[command.preset], size=pixels, seed=command.seed)
@@ -223,7 +222,7 @@ def _views_of_one_size(path: Path) -> Views:
 def check_sets(command: Train) -> None:
     """Raise InputError where the run would: for a set that cannot be read or trained on, or not be validated on. Planes
     always can, and are not drawn."""
-    views_of(replace(command, set=tuple(path for path in command.set if str(path) != PLANES)))
+    views_of(replace(command, set=tuple(path for path in command.set if path != PLANES)))
 
 
 def _paths(paths: Sequence[Path]) -> str | list[str]:

@@ -21,6 +21,7 @@ from scene2spad.options.common import (
 )
 from scenes.errors import require
 
+PLANES = Path("planes")  # the set that needs no renderer
 TrainingPreset = Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"]
 
 
@@ -46,7 +47,7 @@ class Train(Long):
     layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes", "int8"], ...] = ()
     """Switches of the layer that differ from the published one; int8 trains codes for the in-pixel processor: 8 bits
     within ranges that are learned, sums of 16 bits that wrap (begin with --init)."""
-    set: tuple[Path, ...] = (Path("planes"),)
+    set: tuple[Path, ...] = (PLANES,)
     """Folders of sets that `dataset` rendered, or their packs (.h5); planes: random planes, no renderer needed."""
     set_weights: tuple[float, ...] = ()
     """Relative frequency at which patches are drawn from each set (default: alike)."""

@@ -9,8 +9,8 @@ from render.transient.packs import write_pack
 from scene2spad.datasets.planes import random_planes
 from scene2spad.networks.lookup import found_only, obtain
 from scene2spad.networks.registry import ModelRegistry, ModelSpec
-from scene2spad.networks.training import PLANES
 from scene2spad.options.experiments import Study
+from scene2spad.options.networks import PLANES
 from scene2spad.studies.every import SMOKE_MARK, mark_of
 from scenes import InputError
 

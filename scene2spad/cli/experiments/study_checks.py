@@ -11,12 +11,11 @@ from scene2spad.cli.checks import check_image, check_model
 from scene2spad.cli.paths import input_file, output_folder
 from scene2spad.options.common import only_for
 from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study, trains_models
+from scene2spad.options.networks import PLANES
 from scenes.errors import InputError, require
 from scenes.library.catalog import EXTENSIONS, load_scene
 from scenes.library.sets import scene_set
 from spad.sensor.model import PhotonBudget
-
-PLANES = Path("planes")
 
 
 def check_study(command: Study) -> None:

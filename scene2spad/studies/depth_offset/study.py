@@ -23,8 +23,9 @@ from scene2spad.networks.lookup import obtain
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec, Trained, ship_all, subject_of
 from scene2spad.networks.results import Store
 from scene2spad.networks.test_sets import TestSet, depth_map, evaluated, rendered
-from scene2spad.networks.training import PLANES, training_reach_m
+from scene2spad.networks.training import training_reach_m
 from scene2spad.options.experiments import Study
+from scene2spad.options.networks import PLANES
 from scene2spad.studies.depth_offset import figures, range_end, tables
 from scene2spad.studies.depth_offset.plan import (
     OFFSET_M,
@@ -72,7 +73,7 @@ class Session:
         """The 99.9 % depth of the training sets, the largest where they differ; None where it is not told."""
         data = [t.config.data for w, t in self.models.items() if not w.time_offset_m]
         lines = [float(d["training_reach_m"]) for d in data if "training_reach_m" in d]
-        if not lines and self.trained_on not in (None, Path(PLANES)):
+        if not lines and self.trained_on not in (None, PLANES):
             lines = [training_reach_m(split_views(read_views(self.trained_on))[0])]
         return max(lines, default=None)
 
