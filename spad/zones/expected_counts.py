@@ -133,19 +133,11 @@ class ZoneModel:
         late = values["delay"][zone] * FINE + capture.drift_s / step_s
         chirp = values["chirp"][0] / FINE
         period_m = self.period * values["bin_width"][0] * SPEED_OF_LIGHT_M_PER_S
-        stray = stray_returns(capture.returns[zone], values["leak"][zone], values["echo"][zone])
-        stray, direct = (since_emission(light, period_m) for light in (stray, capture.returns[zone]))
-        alone = [ZoneReturns(*(column[at : at + 1] for column in stray)) for at in range(len(stray.light))]
-        parts = []
-        for light in (direct, *alone):
-            for skewed, weight in _skewed(light, values["skew"][zone], FINE / scale):
-                start, part = _masses(skewed, scale, late, chirp)
-                parts.append((start, weight * part))
-        first = min(start for start, _ in parts)
-        mass = np.zeros(max(start + len(part) for start, part in parts) - first)
-        for start, part in parts:
-            mass[start - first : start - first + len(part)] += part
-        return first, mass
+        seen = capture.returns[zone]
+        stray = stray_returns(seen, values["leak"][zone], values["echo"][zone])
+        light = ZoneReturns(*(np.concatenate(pair) for pair in zip(seen, stray, strict=True)))
+        skewed = _skewed(since_emission(light, period_m), values["skew"][zone], FINE / scale)
+        return _masses(skewed, scale, late, chirp)
 
     def flux(self, values: Values, capture: ZoneCapture) -> np.ndarray:
         own = np.array([self.own(values, capture, zone) for zone in range(self.zones)])
@@ -195,13 +187,17 @@ class ZoneModel:
         return (self.own(up, capture, zone) - self.own(down, capture, zone)) / width
 
 
-def _skewed(returns: ZoneReturns, squared: float, bin_m: float) -> list[tuple[ZoneReturns, float]]:
-    """Return the light with a zone's squared skew [bins squared], as parts and their weights.
+def _skewed(returns: ZoneReturns, squared: float, bin_m: float) -> ZoneReturns:
+    """Return the light with a zone's squared skew [bins squared].
 
     Below 0 it is the extrapolation of what a skew does: twice the light as it is, less the light that is skewed.
     """
     skewed = with_skew(returns, math.sqrt(abs(squared)) * bin_m)
-    return [(skewed, 1.0)] if squared >= 0 else [(returns, 2.0), (skewed, -1.0)]
+    if squared >= 0:
+        return skewed
+    near_m, far_m, light = (np.concatenate(pair) for pair in zip(returns, skewed, strict=True))
+    weight = np.repeat((2.0, -1.0), (len(returns.light), len(skewed.light)))
+    return ZoneReturns(near_m, far_m, weight * light)
 
 
 def _masses(returns: ZoneReturns, scale: float, late: float, chirp: float) -> tuple[int, np.ndarray]:
@@ -211,9 +207,21 @@ def _masses(returns: ZoneReturns, scale: float, late: float, chirp: float) -> tu
     length = np.maximum(far - near, 1e-6)
     near = near + late
     first, last = math.floor(near.min()) - 1, math.ceil((near + length).max()) + 2
-    after = np.arange(first - 1, last + 2)[:, None] - near
-    area = (np.maximum(after, 0) ** 2 - np.maximum(after - length, 0) ** 2) @ (light / (2 * length))
-    return first, np.convolve(np.diff(area, 2), np.ones(FINE))
+    density, steps = light / length, last - first + 1
+    held = _shared_out(near - first, density, steps) - _shared_out(near - first + length, density, steps)
+    return first, np.convolve(held, np.ones(FINE))
+
+
+def _shared_out(start: np.ndarray, density: np.ndarray, steps: int) -> np.ndarray:
+    """Return light that is even from `start` on, each bit of it shared by the whole steps beside it: (steps,).
+
+    The nearer has more, in proportion: that is the integral of a pulse that is uniform over a step.
+    """
+    at = np.floor(start).astype(np.int64)
+    after = start - at
+    whole = np.cumsum(np.bincount(at + 2, density, steps))
+    partly = np.bincount(at, density * (1 - after) ** 2 / 2, steps)
+    return whole + partly + np.bincount(at + 1, density * (1 - after**2 / 2), steps)
 
 
 def _beside(values: Values, name: str, at: int) -> tuple[Values, Values, float]:
