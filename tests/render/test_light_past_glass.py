@@ -39,13 +39,19 @@ def indirect(scene: Scene, spp: int = 256) -> float:
     return float(rendered.radiance[rendered.bounces > 1].sum(dtype=np.float64))
 
 
-@pytest.mark.parametrize("laser", [Laser(), Laser(cone_deg=360)], ids=["flash", "lamp"])
+@pytest.fixture(scope="module", params=[Laser(), Laser(cone_deg=360)], ids=["flash", "lamp"])
+def lit(request: pytest.FixtureRequest) -> tuple[Laser, float]:
+    """A laser, and the corridor's indirect light without anything aside."""
+    return request.param, indirect(corridor(laser=request.param), spp=32)
+
+
 @pytest.mark.parametrize(
     "material", [GLASS, Material("thindielectric"), Material(opacity=0.0)], ids=["thick glass", "pane", "cut-out"]
 )
-def test_what_stands_aside_takes_no_light(material: Material, laser: Laser) -> None:
+def test_what_stands_aside_takes_no_light(material: Material, lit: tuple[Laser, float]) -> None:
+    laser, alone = lit
     aside = indirect(corridor(slab(5, material), laser=laser), spp=32)
-    assert aside == pytest.approx(indirect(corridor(laser=laser), spp=32), rel=1e-3)  # by the same paths
+    assert aside == pytest.approx(alone, rel=1e-3)  # by the same paths
 
 
 def test_a_slab_between_two_walls_lets_through_what_a_path_tracer_finds() -> None:
