@@ -224,7 +224,10 @@ def test_other_lasers_are_refused_in_one_line(mode):
 
 @pytest.mark.slow
 def test_bias_and_depth_under_a_flash():
-    """Mean of 32 filtered runs of the flash scene: off by at most 0.5 % after the pulse, depth by 1 mm (median)."""
+    """Mean of 8 filtered runs of the flash scene: off by at most 0.5 % after the pulse, depth by 1 mm (median).
+
+    Its square, by independent halves, is 1.0e-5, and spreads by 0.05e-5: pairs of single runs of truth by 0.09e-5.
+    """
     import torch
 
     from scene2spad.bench.rendering.errors import pulsed
@@ -245,7 +248,7 @@ def test_bias_and_depth_under_a_flash():
             means[number % 2] += pulsed(binned(samples, size * size, BINS, BIN_M)) / (runs / 2)
         return means
 
-    (one, other), (first, second) = half_means(1024, 16, 100, False), half_means(64, 32, 0, True)
+    (one, other), (first, second) = half_means(1024, 4, 100, False), half_means(64, 8, 0, True)
     squared = ((first - one) * (second - other)).sum() / (one * other).sum()
     assert squared < 0.005**2, math.sqrt(squared)
     photons = 1000 / (one + other).sum(axis=1).mean()
