@@ -211,14 +211,16 @@ def test_a_calibration_finds_a_pulse_that_it_did_not_begin_with(pulse):
 @pytest.mark.slow
 @pytest.mark.parametrize("pulse", [NARROW, SKEWED], ids=["Gaussian", "Gaussian with a tail"])
 def test_a_calibrations_intervals_cover_the_truth(pulse):
-    """25 repetitions from another pulse, bin width and no skew: of 95 % intervals about 95 % hold the truth.
+    """12 repetitions from another pulse, bin width and no skew: of 95 % intervals about 95 % hold the truth.
 
-    Within a repetition errors go together, so that the share of one number spreads as that of 25 draws at the least.
+    Within a repetition errors go together, so that the share of one number spreads as that of 12 draws at the least;
+    all numbers together spread by a fifth of a draw's 22 %, two of which are allowed.
     """
-    off = [calibrated_errors(pulse, seed)[0] for seed in range(1, 26)]
+    off = [calibrated_errors(pulse, seed)[0] for seed in range(1, 13)]
     covered = {name: np.mean([np.abs(errors[name]) < 1.96 for errors in off]) for name in off[0]}
-    assert min(covered.values()) > 0.95 - 3.5 * math.sqrt(0.95 * 0.05 / 25), covered
-    assert np.mean([*covered.values()]) == pytest.approx(0.95, abs=0.03), covered
+    draws = math.sqrt(0.95 * 0.05 / len(off))
+    assert min(covered.values()) > 0.95 - 3.5 * draws, covered
+    assert np.mean([*covered.values()]) == pytest.approx(0.95, abs=0.7 * draws), covered
 
 
 def test_smoothing_leaves_gaussians_and_exponentials_alone():
