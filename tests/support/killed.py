@@ -82,10 +82,11 @@ class Warm:
         """`before`: a command that runs this one, as `unshare` does."""
         command = [*before, sys.executable, "-c", SERVER, *MODULES]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+        environment["PYTHONFAULTHANDLER"] = "1"  # of workers, too: `wait` asks those that hang where they are
         self._server = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
-        self._alive: set[int] = set()
+        self._alive: dict[int, Path] = {}  # and what they print into
         self._ended: dict[int, int] = {}
         self.cpu_s = 0.0  # of the child that was waited for last
 
@@ -104,7 +105,7 @@ class Warm:
     def start(self, code: str, folder: Path, output: Path, **environment: str) -> int:
         """Run code in a new process group; returns its number."""
         child = self._ask(code=code, folder=str(folder), output=str(output), environment=environment)
-        self._alive.add(child)
+        self._alive[child] = output
         return child
 
     def status(self, child: int) -> int | None:
@@ -113,12 +114,13 @@ class Warm:
             found = self._ask(poll=child)
             if found is None:
                 return None
-            self._alive.remove(child)
+            del self._alive[child]
             self._ended[child] = found
         return self._ended[child]
 
     def wait(self, child: int, cpu_s: float = math.inf, seconds: float = math.inf) -> int | None:
-        """Exit status; None where the group still runs after so many CPU-seconds, or seconds, or where it hangs.
+        """Exit status; None where the group still runs after so many CPU-seconds, or seconds. AssertionError, with the
+        stacks of all threads, where it hangs.
 
         Moments are told in CPU-seconds: they fall on the same work on a machine that does other things beside.
         """
@@ -130,7 +132,10 @@ class Warm:
             if time.monotonic() - looked > 1:
                 looked = time.monotonic()
                 if hang.found():
-                    break
+                    output = self._alive[child]
+                    self.kill(child, signal.SIGABRT)
+                    time.sleep(1)  # each process writes its stacks, and ends
+                    raise AssertionError(f"process group {child} hangs:\n{output.read_text()}")
         return status
 
     def kill(self, child: int, number: int = signal.SIGKILL) -> None:
