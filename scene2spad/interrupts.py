@@ -32,7 +32,8 @@ def stop_signals_interrupt() -> None:
 def _interrupt(number: int, frame: FrameType | None) -> None:
     import signal
 
-    _received.append(number)
+    if number != signal.SIGALRM:  # of `interrupt_again`
+        _received.append(number)
     handler = signal.getsignal(signal.SIGINT)  # not always Python's own: it may be held back for a moment
     if callable(handler):
         handler(signal.SIGINT, frame)
@@ -52,7 +53,7 @@ def interrupt_again(swallowed: sys.UnraisableHookArgs) -> None:
         return
     import signal
 
-    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.signal(signal.SIGALRM, _interrupt)
     signal.setitimer(signal.ITIMER_REAL, 0.01)
 
 

@@ -192,6 +192,21 @@ IN_A_DESTRUCTOR = """
             os.kill(os.getpid(), signal.SIGINT)
     Dying()
 """
+WHILE_IT_IS_HELD_BACK = """
+    from render.backend.interrupts import interrupts_wait
+    class Dying:
+        def __del__(self):
+            raise KeyboardInterrupt
+    with interrupts_wait():
+        Dying()
+        try:
+            end = time.monotonic() + 1
+            while time.monotonic() < end:
+                pass
+        except KeyboardInterrupt:
+            print("not held back", file=sys.stderr)
+            raise
+"""
 IN_A_START_IN_C = """
     try:
         raise KeyboardInterrupt
@@ -200,10 +215,13 @@ IN_A_START_IN_C = """
 """
 
 
-@pytest.mark.parametrize("comes", [IN_A_DESTRUCTOR, IN_A_START_IN_C], ids=["destructor", "start in C++"])
+SWALLOWED = {"destructor": IN_A_DESTRUCTOR, "held back": WHILE_IT_IS_HELD_BACK, "start in C++": IN_A_START_IN_C}
+
+
+@pytest.mark.parametrize("comes", SWALLOWED.values(), ids=SWALLOWED.keys())
 def test_ctrl_c_that_python_swallows_or_renames_is_one_line(comes):
     program = f"""
-import os, signal, sys, types
+import os, signal, sys, time, types
 from scene2spad.start import script
 def main(argv):{comes}
     while True:
