@@ -7,22 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import re
-import signal
-import time
-from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, islice
-from multiprocessing import active_children, get_context
-from multiprocessing.process import BaseProcess
-from threading import Thread
-from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Protocol
 
-from render.backend.interrupts import interrupts_wait
+from scene2spad.datasets.processes import TRIES, Lost, Numbers, Result, Work, on_processes
 from scenes.errors import InputError, require
 
 if TYPE_CHECKING:
@@ -32,13 +24,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("scene2spad")
 
 MAX_WORKERS = 256
-TRIES = 3  # of a number whose worker process died, among others; then once by itself
 CONNECT_S, CLOSE_S = 10, 2  # until a scheduler that does not answer is given up, and one is left
-LOOK_S = 0.1  # Ctrl-C waits so long at most
-Numbers = tuple[int, ...]
-Result = TypeVar("Result")
-Work: TypeAlias = Callable[[Numbers], list[Result]]  # one result a number; pickled to other processes
-Lost: TypeAlias = Callable[[int, str], Result]  # the result of a number that nobody could do, and why
 
 
 class Run(Protocol):
@@ -76,110 +62,11 @@ def executor(workers: int, scheduler: str | None) -> Iterator[Run]:
             elif workers == 1:
                 results = (result for some in runs for number in some for result in work((number,)))
             else:
-                results = _on_processes(workers, work, runs, lost)
+                results = on_processes(workers, work, runs, lost)
             stack.callback(results.close)
             return results
 
         yield run
-
-
-def _on_processes(
-    workers: int, work: Work[Result], runs: Iterable[Numbers], lost: Lost[Result]
-) -> Generator[Result, None, None]:
-    """Several processes of ours. One that dies takes the pool with it: a new one goes on, and retries what was lost."""
-    runs = iter(runs)
-    first = list(islice(runs, workers))
-    waiting: Iterator[Numbers] = chain(first, runs)
-    tries: Counter[int] = Counter()
-    workers = max(1, min(workers, len(first)))
-    threads, others = max(1, (os.cpu_count() or 1) // workers), {*active_children()}
-    while True:
-        running: dict[Future[list[Result]], Numbers] = {}
-        try:
-            with _pool(workers, threads, others) as pool:
-                while True:
-                    for run in islice(waiting, 2 * workers - len(running)):
-                        try:
-                            running[_submitted(pool, work, run)] = run
-                        except BrokenProcessPool:  # noticed here first: nobody has this run
-                            waiting = chain([run], waiting)
-                            raise
-                    if not running:
-                        return
-                    for future in _finished(running):
-                        done = future.result()
-                        del running[future]
-                        yield from done
-        except BrokenProcessPool:
-            log.warning("a worker process died; starting others")
-        numbers = sorted(number for run in running.values() for number in run)
-        tries.update(numbers)
-        for number in numbers:
-            if tries[number] >= TRIES:
-                try:
-                    with _pool(1, threads, others) as pool:
-                        alone = _submitted(pool, work, (number,))
-                        done = next(iter(_finished([alone]))).result()
-                    yield from done
-                except BrokenProcessPool:
-                    yield lost(number, f"its process died {TRIES + 1} times, at last by itself")
-        waiting = chain([(number,) for number in numbers if tries[number] < TRIES], waiting)
-
-
-@contextmanager
-def _pool(workers: int, threads: int, others: set[BaseProcess]) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool whose processes are ended at once where something else than their own death ends the work: all
-    children but `others`."""
-    with interrupts_wait():  # a semaphore half made would never be removed
-        made = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (threads, os.getpid()))
-    with made as pool:
-        try:
-            yield pool
-        except BrokenProcessPool:
-            raise
-        except BaseException:  # Ctrl-C, a full disk
-            for child in {*active_children()} - others:
-                child.kill()
-            raise
-
-
-def _submitted(pool: ProcessPoolExecutor, work: Work[Result], run: Numbers) -> Future[list[Result]]:
-    """Give a run to a pool. Ctrl-C is kept from processes that start meanwhile, for good: their parent ends them."""
-    with interrupts_wait():
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            return pool.submit(work, run)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _finished(running: Collection[Future[list[Result]]]) -> set[Future[list[Result]]]:
-    """Wait for the first runs that are done.
-
-    Ctrl-C comes between two looks: `wait` takes the locks of all runs, and those that it held when an exception ends it
-    stay locked, so that the pool would never end.
-    """
-    while True:
-        with interrupts_wait():
-            if done := wait(running, LOOK_S, FIRST_COMPLETED).done:
-                return done
-
-
-def _start_worker(threads: int, parent: int) -> None:
-    """In a new process: as many threads as its share of the cores; it ends when the one that started it does."""
-    Thread(target=_end_with, args=(parent,), daemon=True).start()
-    from render.backend.llvm import start_mitsuba
-
-    start_mitsuba()
-    import drjit
-
-    drjit.set_thread_count(threads)
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
 
 
 @contextmanager

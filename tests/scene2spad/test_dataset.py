@@ -8,8 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,8 +20,8 @@ from set_folders import begun
 from render.transient import read_transient
 from render.transient.packs import PATH_STEP_M, read_pack
 from scene2spad.cli import main
+from scene2spad.datasets import processes
 from scene2spad.datasets import rendering as dataset
-from scene2spad.datasets import workers
 from scene2spad.datasets.packing import pack_set
 from scene2spad.datasets.rendering import Job, make_set, render_view
 from scene2spad.datasets.workers import executor
@@ -307,26 +305,9 @@ def test_a_dead_worker_process_loses_nothing(whole, tmp_path):
     assert process.wait() == 0 and contents(out) == contents(whole)
 
 
-def test_a_run_that_a_broken_pool_refuses_is_not_lost(monkeypatch):
-    """The death of a worker can be noticed by `submit`, whose run then nobody has."""
-    refused = []
-
-    def submit(pool, work, run):
-        if run == (3,) and not refused:
-            refused.append(run)
-            raise BrokenProcessPool("a worker died")
-        return ordinary(pool, work, run)
-
-    ordinary = ProcessPoolExecutor.submit
-    monkeypatch.setattr(ProcessPoolExecutor, "submit", submit)
-    with executor(2, None) as run:
-        found = list(run(list, [(number,) for number in range(6)], lambda number, why: -1))
-    assert refused and sorted(found) == list(range(6))
-
-
 def test_only_what_ends_its_process_by_itself_is_lost(monkeypatch):
     """Others that were under way when number 3 ended the processes, three times and more, are done."""
-    monkeypatch.setattr(workers, "_start_worker", max)  # a worker of no renderer
+    monkeypatch.setattr(processes, "start_worker", max)  # a worker of no renderer
     with executor(3, None) as run:
         found = list(run(end_at_three, [(number,) for number in range(8)], lambda number, why: (number, why)))
     lost = [one for one in found if isinstance(one, tuple)]
