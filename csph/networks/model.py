@@ -22,7 +22,7 @@ from csph.networks.blockwise import Blockwise, mixers_for
 from csph.networks.choice import network_of, own_network
 from csph.networks.config import ModelConfig, TrainConfig, grows
 from csph.networks.grid import published_position
-from csph.networks.images import TILE, WHOLE_PIXELS, Span, spans
+from csph.networks.images import TILE, WHOLE_PIXELS, Span, sees_photons, spans
 from csph.networks.posterior import Decoder, confidence, decoded
 from csph.networks.published import parameters_of
 from csph.networks.refined import Refined
@@ -42,7 +42,7 @@ class Estimate(NamedTuple):
     """Depth estimate of an image by a network.
 
     depth_m      (H, W) float32 [m]
-    confidence   (H, W) float32: share of the posterior within 3 bins of the answer (`posterior.confidence`)
+    confidence   (H, W) float32: share of the posterior within 3 bins of the answer; 0 where the network sees no photon
     overflows    16-bit sums that wrapped
     """
 
@@ -240,7 +240,6 @@ class DepthModel(nn.Module):
         require(whole, f"tiles of {tile!r} pixels, expected a whole number of 1 or more")
         require(int8_rule in INT8_RULES, f"8-bit rule {int8_rule!r} is unknown, expected {' or '.join(INT8_RULES)}")
         self.check_histogram(histogram)
-        device = next(self.parameters()).device
         rows, columns, bins = histogram.counts.shape
         tile = tile or (TILE if rows * columns > WHOLE_PIXELS else None)
         depth, sure, overflows = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32), 0
@@ -255,13 +254,14 @@ class DepthModel(nn.Module):
             if int8:
                 logits, wrapped = self._logits_int8(counts, inside, int8_rule)
             else:
-                logits, wrapped = self(counts.to(device).float()), 0
+                logits, wrapped = self(counts.to(next(self.parameters()).device).float()), 0
             overflows += wrapped
             logits = logits[..., inside[0], inside[1]]
             place = decoded(logits, decoder or self.config.decoder)
             sure[down.own, across.own] = confidence(logits, place)[0].cpu()
             depth[down.own, across.own] = (self._on_grid(place) * self.config.sensor.bin_depth_m)[0].cpu()
-        return Estimate(radial_depth_of(histogram, depth), sure, overflows)
+        seen = sees_photons(histogram.counts, self.network.reach, self.config.block)
+        return Estimate(radial_depth_of(histogram, depth), sure * seen, overflows)
 
     def _logits_int8(self, counts: Tensor, inside: tuple[slice, slice], rule: Int8Rule) -> tuple[Tensor, int]:
         """Compute logits from codes of 8-bit weights, and how many sums wrapped of the blocks that reach `inside`."""

@@ -153,6 +153,21 @@ def test_images_that_blocks_do_not_tile(size):
     assert (found.confidence >= 0).all() and (found.confidence <= 1).all()
 
 
+def test_a_network_that_sees_no_photon_is_not_sure():
+    """Without one it answers what training made likely; it was up to 64 % sure of that. Photons at its side count."""
+    network = DepthModel(ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL), 2).eval()
+    histogram = sense(random_planes(1, size=64, seed=2).transients[0], SMALL, PhotonBudget(20, 5), seed=1)
+    counts = np.zeros_like(histogram.counts)
+    for tile in (None, 16):
+        dark = network.estimate(replace(histogram, counts=counts), tile=tile)
+        assert not dark.confidence.any() and np.isfinite(dark.depth_m).all()
+    counts[0, 0, 7] = 1
+    found = network.estimate(replace(histogram, counts=counts))
+    changed = found.depth_m != dark.depth_m
+    assert changed.sum() > 100 and (found.confidence[changed] > 0).all()
+    assert found.confidence[0, 0] > 0 and not found.confidence[32:].any()
+
+
 @pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
 def test_answers_do_not_depend_on_mixed_precision(kind):
     """A sum in bf16 holds 8 bits, in float16 11: the mean of a peak was off by bins."""
