@@ -30,9 +30,8 @@ def read_summary(path: Path) -> Summary:
     a table of another kind."""
     from csph.evaluation.methods import Evaluation, Row  # loads PyTorch, which a page without evaluations does not need
 
-    texts = ("method", "scene", "group", "law")
-    read = [{key: str(v) if key in texts else v for key, v in row.items()} for row in read_rows(path)]
-    found = Evaluation([Row(**row) for row in read])  # type: ignore[arg-type]
+    rows_read = read_rows(path, ("method", "scene", "group", "law"))
+    found = Evaluation([Row(**row) for row in rows_read])  # type: ignore[arg-type]
     rows = []
     for method in dict.fromkeys(row.method for row in found.rows):
         line: dict[str, object] = {"method": method}

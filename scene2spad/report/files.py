@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import time
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -36,6 +37,9 @@ UNREADABLE = (
     OSError, ValueError, TypeError, KeyError, SyntaxError, RecursionError, struct.error, zlib.error,
     Image.DecompressionBombError,
 )  # fmt: skip
+
+_WHOLE = re.compile(r"-?(0|[1-9]\d*)", re.ASCII)
+_REAL = re.compile(r"-?((0|[1-9]\d*)\.\d+(e[-+]\d+)?|\d+e[-+]\d+|inf)|nan", re.ASCII)
 
 Content = TypeVar("Content")
 
@@ -160,19 +164,17 @@ def read_png(path: Path) -> tuple[bytes, tuple[int, int]]:
         return data, image.size
 
 
-def read_rows(path: Path) -> list[dict[str, int | float | str]]:
-    """Return rows of a table, with its numbers as such; InputError where it is none, or lines are cut."""
-    return [{key: _number(text) for key, text in row.items()} for row in read_csv(path)]
+def read_rows(path: Path, texts: Collection[str] = ()) -> list[dict[str, int | float | str]]:
+    """Return rows of a table, with its numbers as such but for the columns `texts`; InputError where it is none, or
+    lines are cut."""
+    return [{key: text if key in texts else _number(text) for key, text in row.items()} for row in read_csv(path)]
 
 
 def _number(text: str) -> int | float | str:
-    """Return a table's cell as the number that it spells, if it does."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+    """Return a table's cell as the number that it spells as Python does; names such as 2026_11 and 007 are none."""
+    if _WHOLE.fullmatch(text):
+        return int(text)
+    return float(text) if _REAL.fullmatch(text) else text
 
 
 def rows_in(value: object) -> Sequence[dict[str, object]]:

@@ -295,6 +295,23 @@ def test_the_same_results_give_the_same_page(tree, capfd):
     assert first == second and "study/codes.png: is no picture" in first[0]["problems"]
 
 
+def test_names_that_look_like_numbers_are_names(tree, capfd):
+    """Captures 2026_11_29 and 007 stood there as 20261129 and 7; scenes 1 and 01 were one, and so were methods."""
+    lines = [f"{name},argmax,{value}" for name, value in (("2026_11_29", "1e-05"), ("007", "-1.5"), ("1e5", "12"))]
+    put(tree / "study/real-data.csv", "\n".join(["capture,method,mae_mm", *lines]) + "\n")
+    head = "method,scene,view,signal,background,group,mae_mm,rmse_mm,within_1mm,within_5mm,within_10mm,within_20mm,ssim"
+    rows = [
+        f"{name},{scene},{view},1,1,all,{mae},9,0,0,0.5,1,1,9,0,0"
+        for name in ("7", "007")
+        for view, (scene, mae) in enumerate((("1", 10), ("01", 20), ("01", 30)))
+    ]
+    put(tree / "evaluate/evaluation.csv", "\n".join([f"{head},pixels,missing,beyond_range", *rows]) + "\n")
+    page = Page(made(tree, capfd)[1])
+    assert "2026_11_29 argmax 1e-05 007 argmax -1.5 1e5 argmax 12" in page.words
+    # mean of 10 and 25, not of three images
+    assert "7 17.5 – 9 50 1 007 17.5 – 9 50 1" in page.words
+
+
 def test_means_of_every_evaluation_are_shown_with_their_places(tree, capfd):
     """Show those that `evaluate` forms: each scene counts by its mean over views and levels."""
     head = (
