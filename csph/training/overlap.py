@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 from csph.training.views import Views, name_with_seed, set_seed, short_hash, view_key
@@ -36,6 +37,20 @@ def overlap(training: Sequence[Views], validation: Sequence[Views]) -> Overlap:
         same_views += sum(view_key(view) in trained_views for view in views.transients)
         same_scenes += sum(scene in shared for scene in views.scenes)
     return Overlap(number, same_views, same_scenes)
+
+
+def repeated(sets: Sequence[Views]) -> tuple[int, int] | None:
+    """Return the numbers of the first two sets of the same views; None where there are none.
+
+    A view in a folder and in a pack is the same. Under other light it is another: with indirect or ambient light.
+    """
+    shown = [{_lit_key(view) for view in views.transients} for views in sets]
+    return next(((i, j) for i, j in combinations(range(len(shown)), 2) if shown[i] == shown[j]), None)
+
+
+def _lit_key(view: Transient) -> tuple[str, int, bool]:
+    """Return what a view shows and what tells its light apart, none of which a pack rounds."""
+    return view_key(view), view.returns, bool(view.ambient.any())
 
 
 def _keys_by_scene(views: Views) -> dict[str, set[str]]:

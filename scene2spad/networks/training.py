@@ -23,7 +23,7 @@ from csph.networks.config import ON_CPU, Front, ModelConfig, Network, TrainConfi
 from csph.networks.model import DepthModel, load_model
 from csph.training.beginning import NetworkOf, WeightsOf, check_init
 from csph.training.lineage import begin_with
-from csph.training.overlap import overlap
+from csph.training.overlap import overlap, repeated
 from csph.training.own_codes import FILE, codes_path
 from csph.training.resume import require_free
 from csph.training.views import Views, is_seen, read_views, split_views
@@ -45,6 +45,7 @@ log = logging.getLogger("scene2spad")
 PLANE_SCENES = {"smoke": 20, "laptop": 2000, "laptop-v1": 2000, "workstation": 4000, "gpu": 4000, "paper": 13851}
 SMOKE_PIXELS = 32
 DEFAULT_COMPRESSION = 128.0
+_WEIGHTED = "; --set-weights says how often a set is drawn from"
 
 
 def config_of(command: Train) -> TrainConfig:
@@ -152,7 +153,7 @@ def _check_numbers(command: Train) -> None:
     for option, paths in (("set", command.set), ("validation", command.validation)):
         places = [path.resolve() for path in paths]
         twice = next((path for path, place in zip(paths, places, strict=True) if places.count(place) > 1), None)
-        cure = "; --set-weights says how often a set is drawn from" if option == "set" else ""
+        cure = _WEIGHTED if option == "set" else ""
         require(twice is None, f"train: --{option} {twice} is given twice{cure}")
 
 
@@ -171,14 +172,25 @@ def _default_network(command: Train, design: Design | None) -> Network:
 def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, object]]:
     """Return training and validation views of every set, and the words that say which they are."""
     sets = [_views_of_set(path, command) for path in command.set]
+    check_once("set", command.set, sets)
     common = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
     if command.validation:
         training, validation = sets, [_views_of_one_size(path) for path in command.validation]
+        check_once("validation", command.validation, validation)
     else:
         parts = [_split(path, views) for path, views in zip(command.set, sets, strict=True)]
         training, validation = [first for first, _ in parts], [second for _, second in parts]
     check_apart(command, training, validation)
     return training, validation, {**common, "training_reach_m": max(map(training_reach_m, training), default=0.0)}
+
+
+def check_once(option: str, paths: Sequence[Path], sets: Sequence[Views]) -> None:
+    """Raise InputError for two sets of the same views, as a folder and its pack."""
+    twice = repeated(sets)
+    if twice is not None:
+        first, second = (paths[number] for number in twice)
+        cure = _WEIGHTED if option == "set" else ""
+        raise InputError(f"train: --{option} {first} and {second} hold the same views{cure}")
 
 
 def check_apart(command: Train, training: Sequence[Views], validation: Sequence[Views]) -> None:

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from csph.training.overlap import Overlap, overlap
+from csph.training.overlap import Overlap, overlap, repeated
 from csph.training.views import Views, is_seen, read_views, scenes_by_seed, split_views, view_key
 from render.transient import Transient
-from render.transient.packs import write_pack
+from render.transient.packs import rounded, write_pack
 from scene2spad.datasets.planes import random_planes
 
 
@@ -42,6 +42,18 @@ def test_shared_views_and_scenes_are_counted():
     # packs of before keep no notes: one view of one camera tells that all of the scene is known
     digests = [Views((replace(one, meta={"scene_sha256": "a"}),), ("x",)) for one in second.transients[:2]]
     assert overlap(digests[:1], digests[1:]) == Overlap(1, 0, 1)
+
+
+def test_sets_of_the_same_views_are_known_in_a_folder_and_in_a_pack(tmp_path):
+    """Not views under other light, and not sets that share some views alone."""
+    views = random_planes(4, size=8)
+    folder = Views([rounded(one) for one in views.transients], views.scenes)
+    write_pack(((one, {"scene": name}) for one, name in zip(*folder, strict=True)), tmp_path / "planes.h5")
+    packed = read_views(tmp_path / "planes.h5")
+    first = Views(packed.transients[:3], packed.scenes[:3])
+    dark = Views([replace(one, ambient=0 * one.ambient) for one in packed.transients], packed.scenes)
+    assert repeated([folder, packed]) == (0, 1) and repeated([first, folder, dark, packed]) == (1, 3)
+    assert repeated([folder, first, dark]) is None is repeated([folder])
 
 
 def test_scenes_of_several_seeds_in_a_pack_are_several(tmp_path):

@@ -33,6 +33,19 @@ def test_a_test_on_views_of_training_says_so(capfd, packed, trained, tmp_path):
         assert told == ["1"] * said
 
 
+def test_a_set_that_is_given_under_two_names_is_refused(capfd, packed, tmp_path):
+    """Its views were drawn twice as often as those of others, without a word."""
+    again, out = pack(read_views(packed), tmp_path / "again.h5", grid=4), tmp_path / "run"
+    others = str(pack(random_planes(3, size=16, seed=9), tmp_path / "others.h5"))
+    cure = "; --set-weights says how often a set is drawn from"
+    for asked, option, end in (((), "set", cure), (("--set", others, "--validation"), "validation", "")):
+        sets = [*(asked or ("--set",)), str(again), str(packed)]
+        assert main(["train", *QUICK, *sets, "--out", str(out)]) == 2
+        said = capfd.readouterr().err.strip().splitlines()[-1]
+        assert said.endswith(f"train: --{option} {again} and {packed} hold the same views{end}")
+    assert not out.exists()
+
+
 def test_views_of_training_are_known_one_by_one(capfd, packed, trained, tmp_path):
     """Some of them among others, too. Runs of before have one hash of all: known where the set is the same."""
     seen, other = read_views(packed), random_planes(3, size=16, seed=9)
