@@ -41,6 +41,7 @@ def script() -> None:
         status = 0 if isinstance(error, BrokenPipeError) else 2
         if status:
             print(f"scene2spad: standard output: {error.strerror or error}", file=sys.stderr)
+    exec("")  # Python remembers a Ctrl-C within the last exec(), as of imports, and would end by a signal of its own
     gc.freeze()  # Python would search all libraries for garbage once more at its end: 0.2 s with torch
     sys.exit(status)
 

@@ -320,6 +320,15 @@ def test_signals_that_stop_a_command_let_it_clean_up_and_say_so_in_a_line(tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_signal_within_generated_code_gives_its_status_too(tmp_path):
+    """Imports run much of it, as for dataclasses; `python -m` ended by SIGINT then, whatever the signal."""
+    stopping = STOPPING.format(name="SIGTERM").replace("os.kill(", "exec('os.kill(").replace("SIGTERM)", "SIGTERM)')")
+    heard = "import signal; signal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
+    (tmp_path / "stopping.py").write_text(heard + stopping)
+    done = run_process([sys.executable, "-m", "stopping"], cwd=tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (143, 1) and "interrupted" in done.stderr
+
+
 def test_a_signal_that_is_ignored_stays_ignored(tmp_path):
     """As nohup has it: the terminal may close."""
     program = ["sh", "-c", 'trap "" HUP; exec "$@"', "sh", sys.executable, "-c", STOPPING.format(name="SIGHUP")]
