@@ -369,7 +369,7 @@ def load_model(name: str | Path) -> DepthModel:
     >>> estimate.depth_m.shape, s2s.depth_errors(estimate.depth_m, histogram)["mae_mm"] < 200
     ((8, 8), True)
     """
-    from csph.networks.model import load_model as load
+    from csph.networks.checkpoint import load_model as load
     from csph.weights.cards import checkpoint_of
 
     return load(checkpoint_of(name))[0]

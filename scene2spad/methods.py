@@ -29,7 +29,7 @@ def depth_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
     """
     if is_classical(name):
         return classical_method(name, sensor, seed=seed)
-    from csph.networks.model import load_model
+    from csph.networks.checkpoint import load_model
     from csph.weights.cards import checkpoint_of
 
     try:

@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from csph.networks.model import DepthModel, load_model
+from csph.networks.checkpoint import load_model
+from csph.networks.model import DepthModel
 from csph.weights.cards import checkpoint_of
 from render import RenderSettings, render
 from scenes.errors import InputError, require

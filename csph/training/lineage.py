@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from csph.networks.checkpoint import load_model, weights_sha256
 from csph.networks.config import TrainConfig
-from csph.networks.model import DepthModel, load_model, weights_sha256
+from csph.networks.model import DepthModel
 from csph.training.beginning import Beginning, NetworkOf, WeightsOf, what_is_known
 from csph.training.overlap import ANCESTORS_SCENES, SEEN_SCENES, of_seen_scenes, scene_hashes
 from csph.training.views import ANCESTORS_SEEN, SEEN, Views, is_seen, read_seen, view_key, write_keys

@@ -36,9 +36,10 @@ from torchmetrics import MeanMetric
 
 from csph.codes.rank import coherence, participation_rank
 from csph.codes.tensor import CodingTensor
+from csph.networks.checkpoint import load_model, save_model, weights_sha256
 from csph.networks.config import TrainConfig
 from csph.networks.grid import on_published_grid, published_target
-from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
+from csph.networks.model import DepthModel
 from csph.networks.posterior import DECODERS
 from csph.networks.published import soft_argmax
 from csph.training.beginning import Beginning, NetworkOf, check_init, what_is_known

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from csph.codes.tensor import CodingTensor
 from csph.levels import BACKGROUND, CONTINUOUS, SIGNAL
+from csph.networks.checkpoint import load_model
 from csph.networks.config import TrainConfig
-from csph.networks.model import load_model
 from csph.weights.shipped import CARD, WEIGHTS, shipped_file, shipped_names
 from scenes.errors import InputError, require
 from scenes.json_types import JsonObject

@@ -20,8 +20,9 @@ from torch import Tensor
 
 from csph.codes.design import Design
 from csph.codes.temporal import FIXED_CODES, temporal_code
+from csph.networks.checkpoint import save_model
 from csph.networks.config import ModelConfig, TrainConfig, preset
-from csph.networks.model import DepthModel, save_model
+from csph.networks.model import DepthModel
 from csph.weights.torch_files import load_torch_file
 from scenes.errors import InputError, require
 from spad.sensor.model import PRESETS, Sensor
@@ -42,7 +43,7 @@ class Imported(NamedTuple):
 
 
 def import_checkpoint(path: Path, folder: Path, sensor: Sensor | None = None) -> Imported:
-    """Write a published checkpoint as `folder`/model.safetensors, which `csph.networks.model.load_model` reads.
+    """Write a published checkpoint as `folder`/model.safetensors, which `csph.networks.checkpoint.load_model` reads.
 
     `sensor` (default: that of the published training set) is the one whose histograms the model is to take: what it
     learned of pulses was in bins, and the paper tests it on the reference sensor. Nothing but tensors and plain values

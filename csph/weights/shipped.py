@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from csph.networks.model import checkpoint_file, load_model, save_model
+from csph.networks.checkpoint import checkpoint_file, load_model, save_model
 from scenes.errors import require
 from scenes.files import whole_file
 from scenes.io.inputs import read_whole_lines

@@ -13,8 +13,9 @@ from pathlib import Path
 from csph.evaluation.methods import LEVEL_GROUPS, Evaluation, EvaluationPlan, Method, as_dicts, evaluate
 from csph.evaluation.metrics import INTERVAL_LEVEL
 from csph.levels import PHOTON_LEVELS
+from csph.networks.checkpoint import load_model, tensors_sha256
 from csph.networks.config import TrainConfig
-from csph.networks.model import DepthModel, load_model, tensors_sha256
+from csph.networks.model import DepthModel
 from csph.training.lineage import count_seen
 from csph.training.views import Views, check_truth, training_parts
 from csph.weights.cards import checkpoint_of

@@ -23,8 +23,9 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from csph.evaluation.methods import DepthEstimator
 from csph.evaluation.metrics import image_errors
 from csph.levels import PHOTON_LEVELS
+from csph.networks.checkpoint import load_model
 from csph.networks.grid import published_centroid_bins
-from csph.networks.model import DepthModel, load_model
+from csph.networks.model import DepthModel
 from csph.networks.posterior import DECODERS, Decoder
 from csph.weights.cards import checkpoint_of
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec

@@ -16,8 +16,9 @@ import torch
 
 from csph.codes.design import Design
 from csph.evaluation.methods import DepthEstimator
+from csph.networks.checkpoint import load_model, weights_sha256
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import DepthModel, load_model, weights_sha256
+from csph.networks.model import DepthModel
 from csph.weights.shipped import RESUME, WEIGHTS, file_names, is_shipped, ship, shipped_file
 from scene2spad.networks.training import config_of, run_train
 from scene2spad.options.networks import PLANES, Train, TrainingPreset

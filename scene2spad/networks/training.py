@@ -19,8 +19,9 @@ from csph.codes.design import Design
 from csph.codes.files import own_codes
 from csph.evaluation.methods import DepthEstimator, Method
 from csph.layer import SpatialStart
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ON_CPU, Front, ModelConfig, Network, TrainConfig, preset
-from csph.networks.model import DepthModel, load_model
+from csph.networks.model import DepthModel
 from csph.training.beginning import NetworkOf, WeightsOf, check_init
 from csph.training.lineage import begin_with
 from csph.training.overlap import overlap, repeated

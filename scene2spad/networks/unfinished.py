@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from csph.evaluation.methods import Method
-from csph.networks.model import DepthModel, weights_sha256
+from csph.networks.checkpoint import weights_sha256
+from csph.networks.model import DepthModel
 from scene2spad.networks.training import network_method
 from scenes.errors import InputError
 from scenes.files import link_target, read_arrays, whole_file

@@ -26,7 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csph.evaluation.methods import EvaluationPlan, Method, evaluate
-from csph.networks.model import DepthModel, load_model
+from csph.networks.checkpoint import load_model
+from csph.networks.model import DepthModel
 from csph.training.views import Views
 from csph.weights.cards import checkpoint_of
 from render.transient import Transient, read_transient

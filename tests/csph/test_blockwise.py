@@ -8,9 +8,10 @@ import torch
 
 from csph.codes.design import Design
 from csph.networks.blockwise import BlockMixer, code_features
+from csph.networks.checkpoint import load_model, save_model
 from csph.networks.compact import FOLD
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import DepthModel, load_model, save_model
+from csph.networks.model import DepthModel
 from scenes.errors import InputError
 from spad.sensor.model import Sensor
 

@@ -11,8 +11,9 @@ import torch
 
 from csph.codes.design import Design
 from csph.layer import CompressiveLayer, LayerOptions, make_coding
+from csph.networks.checkpoint import save_model
 from csph.networks.config import ModelConfig, TrainConfig, preset
-from csph.networks.model import DepthModel, save_model
+from csph.networks.model import DepthModel
 from csph.training.beginning import WeightsOf
 from csph.training.loop import train
 from csph.training.views import Views, read_views

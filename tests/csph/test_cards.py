@@ -67,7 +67,7 @@ def test_training_needs_no_renderer_and_no_command_line():
         "for name in ('mitsuba', 'drjit', 'OpenEXR', 'tyro'):\n"
         "    sys.modules[name] = None\n"
         "import csph.training.loop, csph.weights.cards, csph.evaluation.methods\n"
-        "from csph.networks.model import load_model\n"
+        "from csph.networks.checkpoint import load_model\n"
         "from csph.training.views import read_views\n"
         "from csph.weights.cards import shipped_model\n"
         "print(load_model(shipped_model('none-s0'))[0].parameters_count)\n"

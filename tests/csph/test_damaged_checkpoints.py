@@ -11,8 +11,9 @@ import torch
 from safetensors.torch import load_file, save
 
 from csph.codes.design import Design
+from csph.networks.checkpoint import KIND, load_model, save_model, tensors_sha256
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import KIND, DepthModel, load_model, save_model, tensors_sha256
+from csph.networks.model import DepthModel
 from csph.training.resume import claim_run
 from csph.weights.torch_files import load_torch_file
 from scene2spad.studies.tensors import coding_of

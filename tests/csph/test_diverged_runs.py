@@ -6,8 +6,8 @@ import math
 import pytest
 from test_training import FEW, MODEL, near_planes
 
+from csph.networks.checkpoint import load_model
 from csph.networks.config import preset
-from csph.networks.model import load_model
 from csph.training.loop import DepthTraining, train
 from csph.training.views import split_views
 from scenes import InputError

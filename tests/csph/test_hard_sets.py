@@ -11,8 +11,8 @@ from test_training import FEW, MODEL, SMALL, near_planes
 from csph.codes.rank import coherence
 from csph.codes.temporal import MAX_SEED, grouped_energy, orthogonal_start, spatial_seed, uniform_start
 from csph.layer import CompressiveLayer
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ModelConfig, preset
-from csph.networks.model import load_model
 from csph.training.data import TrainBatch
 from csph.training.loop import DepthTraining, Record, train
 from csph.training.views import Views, split_views

@@ -11,8 +11,9 @@ from csph.codes.design import Design
 from csph.codes.files import write_codes
 from csph.codes.quantise import clipped_steps, encode_int16, published_int8, quantised
 from csph.layer import CompressiveLayer
+from csph.networks.checkpoint import load_model, save_model
 from csph.networks.config import ModelConfig, preset
-from csph.networks.model import DepthModel, load_model, save_model
+from csph.networks.model import DepthModel
 from csph.training.loop import DepthTraining, train
 from csph.training.views import split_views
 from scenes import InputError

@@ -7,8 +7,9 @@ from test_training import MODEL, near_planes
 from torch import nn
 
 from csph.codes.design import Design
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ModelConfig, TrainConfig, preset
-from csph.networks.model import DepthModel, load_model
+from csph.networks.model import DepthModel
 from csph.training.loop import train
 from csph.training.optimiser import MOMENTUM, MuonAdam, hidden_weights, make_optimiser, orthogonalised
 from csph.training.views import split_views

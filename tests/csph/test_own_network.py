@@ -6,8 +6,9 @@ import torch
 from torch import nn
 
 from csph.codes.design import Design
+from csph.networks.checkpoint import save_model
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import DepthModel, save_model
+from csph.networks.model import DepthModel
 from scenes import InputError
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor

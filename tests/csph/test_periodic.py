@@ -9,9 +9,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from csph.codes.design import Design
+from csph.networks.checkpoint import load_model, save_model
 from csph.networks.compact import Compact
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import DepthModel, load_model, save_model
+from csph.networks.model import DepthModel
 from csph.networks.periodic import PERIOD, STEP, CircularInTime, Periodic
 from scenes.errors import InputError
 from spad.sensor.model import Sensor

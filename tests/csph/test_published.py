@@ -12,9 +12,10 @@ from pytorch_lightning.callbacks import ModelCheckpoint
 from pytorch_lightning.utilities.parsing import AttributeDict
 
 from csph.codes.design import Design
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ModelConfig
 from csph.networks.grid import published_position
-from csph.networks.model import DepthModel, load_model
+from csph.networks.model import DepthModel
 from csph.networks.published import soft_argmax
 from csph.weights.cards import limits
 from csph.weights.published import FULL, LEFT_OUT, SPATIAL, TEMPORAL, import_checkpoint

@@ -13,9 +13,10 @@ from test_training import FEW, MODEL, SMALL, Stopped, near_planes
 
 from csph.codes.design import Design
 from csph.levels import BACKGROUND, HARDEST, PHOTON_LEVELS, SIGNAL, TRAIN_LEVELS, draw_level
+from csph.networks.checkpoint import load_model, weights_sha256
 from csph.networks.config import RECIPE, ModelConfig, TrainConfig, preset
 from csph.networks.grid import on_published_grid, published_centroid_bins, published_position, published_target
-from csph.networks.model import DepthModel, load_model, weights_sha256
+from csph.networks.model import DepthModel
 from csph.training import loop
 from csph.training.beginning import NetworkOf
 from csph.training.data import DeviceSensing, Requests, Samples, SetData, sensed_batch

@@ -10,9 +10,10 @@ from torch import Tensor
 from csph.codes.design import Design
 from csph.codes.quantise import HALF_RANGE
 from csph.networks.blockwise import code_features
+from csph.networks.checkpoint import load_model, save_model
 from csph.networks.compact import FOLD, averages
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import DepthModel, load_model, save_model
+from csph.networks.model import DepthModel
 from csph.networks.refined import MAX_LOG_AMPLITUDE, unexplained
 from scenes.errors import InputError
 from spad.sensor.model import Sensor

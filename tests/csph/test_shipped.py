@@ -10,8 +10,8 @@ import torch
 from csph.codes.design import Design
 from csph.codes.temporal import bin_energy, grouped_energy, truncated_fourier
 from csph.layer import make_coding
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ModelConfig, preset
-from csph.networks.model import load_model
 from csph.training.loop import train
 from csph.training.views import split_views
 from csph.weights.shipped import checkpoint_name, is_shipped, ship, shipped_file, shipped_names
@@ -75,7 +75,7 @@ def test_shipped_is_small_whole_and_tells_no_folder(trained, tmp_path):
 def test_shipping_forgets_where_the_set_lay(trained, tmp_path):
     from dataclasses import replace
 
-    from csph.networks.model import save_model
+    from csph.networks.checkpoint import save_model
 
     model, config, state = load_model(trained)
     moved = replace(config, data={**config.data, "training": "/somewhere/else/rooms.h5", "validation": "b/v.h5"})

@@ -15,8 +15,9 @@ import torch
 
 from csph.codes.design import Design
 from csph.evaluation.methods import EvaluationPlan, evaluate
+from csph.networks.checkpoint import load_model, save_model, weights_sha256
 from csph.networks.config import PUBLISHED_TV, ModelConfig, TrainConfig, preset
-from csph.networks.model import DepthModel, load_model, save_model, weights_sha256
+from csph.networks.model import DepthModel
 from csph.training.data import Frames, Samples, SetData
 from csph.training.loop import Hardware, train
 from csph.training.loss import kl_divergence, pulse_target, total_variation

@@ -9,8 +9,9 @@ import torch
 
 from csph.codes.design import Design
 from csph.codes.quantise import quantised
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ModelConfig
-from csph.networks.model import DepthModel, load_model
+from csph.networks.model import DepthModel
 from csph.weights.shipped import shipped_file, shipped_names
 from scene2spad.cli import main
 from scene2spad.studies.chip.chain import ChipDepth, FastCores, interpret, network_depth

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from csph import CompressiveLayer, Design
-from csph.networks.model import load_model
+from csph.networks.checkpoint import load_model
 from csph.weights.shipped import shipped_file
 from render.engine import render
 from render.settings import RenderSettings

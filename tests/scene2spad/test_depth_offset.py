@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from csph.evaluation.methods import Row
-from csph.networks.model import load_model
+from csph.networks.checkpoint import load_model
 from csph.weights.cards import shipped_model
 from render.transient.packs import write_pack
 from scene2spad.cli import main

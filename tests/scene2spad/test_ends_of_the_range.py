@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from csph.networks.model import load_model
+from csph.networks.checkpoint import load_model
 from csph.networks.periodic import ENDS_BINS
 from csph.weights.cards import checkpoint_of
 from scene2spad.cli import main

@@ -10,8 +10,9 @@ import torch
 from commands import run
 
 from csph.codes.design import Design
+from csph.networks.checkpoint import load_model, save_model
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import DepthModel, load_model, save_model
+from csph.networks.model import DepthModel
 from render.transient.packs import write_pack
 from scene2spad.cli import main
 from scene2spad.datasets.planes import random_planes

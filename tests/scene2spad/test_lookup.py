@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from csph.networks.model import load_model, save_model
+from csph.networks.checkpoint import load_model, save_model
 from render.transient.packs import write_pack
 from scene2spad.datasets.planes import random_planes
 from scene2spad.networks.lookup import found_only, obtain

@@ -11,8 +11,9 @@ from small_runs import QUICK
 
 from csph.codes.design import OWN, Design
 from csph.codes.files import own_codes
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ModelConfig, TrainConfig
-from csph.networks.model import DepthModel, load_model
+from csph.networks.model import DepthModel
 from csph.weights.cards import model_coding, read_card
 from csph.weights.shipped import CARD, RESUME, ship
 from render.transient import write_transient

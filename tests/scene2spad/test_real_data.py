@@ -9,8 +9,9 @@ import scipy.sparse
 import torch
 
 from csph import Design
+from csph.networks.checkpoint import save_model
 from csph.networks.config import ModelConfig, preset
-from csph.networks.model import DepthModel, save_model
+from csph.networks.model import DepthModel
 from scene2spad.cli import main
 from scene2spad.studies.real_data import study as real_data
 from scene2spad.studies.real_data.figures import View, directions, error_words, projected, raw_cloud

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from small_runs import QUICK
 
-from csph.networks.model import load_model
+from csph.networks.checkpoint import load_model
 from csph.training.lineage import ancestors_of
 from csph.training.overlap import SEEN_SCENES
 from csph.training.views import ANCESTORS_SEEN, SEEN, Views, read_views

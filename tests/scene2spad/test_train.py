@@ -19,8 +19,8 @@ from small_runs import QUICK
 
 from csph.codes.design import Design
 from csph.levels import PHOTON_LEVELS
+from csph.networks.checkpoint import load_model
 from csph.networks.config import ModelConfig, preset
-from csph.networks.model import load_model
 from csph.weights.cards import checkpoint_of
 from csph.weights.shipped import ship
 from render.transient import write_transient

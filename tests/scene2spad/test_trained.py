@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import scene2spad as s2s
-from csph.networks.model import load_model, save_model
+from csph.networks.checkpoint import load_model, save_model
 from csph.weights.shipped import shipped_file, shipped_names
 from scene2spad.cli.main import parse_command
 from scene2spad.datasets.planes import random_planes

@@ -24,7 +24,7 @@ from typing import Any
 from PIL import Image
 from processes import Hang, cpu_seconds
 
-from csph.networks.model import load_model
+from csph.networks.checkpoint import load_model
 from csph.weights.torch_files import check_torch_file
 from render.transient import read_transient
 from render.transient.packs import read_pack

@@ -132,8 +132,9 @@ def _read_capture(path: Path) -> Numbers:
 
 def _write_weights(path: Path) -> None:
     from csph.codes.design import Design
+    from csph.networks.checkpoint import save_model
     from csph.networks.config import ModelConfig, TrainConfig
-    from csph.networks.model import DepthModel, save_model
+    from csph.networks.model import DepthModel
     from spad.sensor.model import Sensor
 
     design = Design.named("learned", (16, 2, 2), codes=8)
@@ -142,7 +143,7 @@ def _write_weights(path: Path) -> None:
 
 
 def _read_weights(path: Path) -> Numbers:
-    from csph.networks.model import load_model
+    from csph.networks.checkpoint import load_model
 
     model, _, _ = load_model(path)
     return ((value.numpy(), False) for value in model.state_dict().values())

@@ -134,7 +134,7 @@ def _asm(command: Ultraphase, progress: Progress) -> dict:
 
 def _compile(command: Ultraphase, progress: Progress) -> dict:
     """Show a trained model's program: what it takes, what it costs, and that it computes the torch path's integers."""
-    from csph.networks.model import load_model
+    from csph.networks.checkpoint import load_model
     from csph.weights.cards import checkpoint_of
     from csph.weights.shipped import checkpoint_name
     from scene2spad.studies.chip.chain import measured, trial

@@ -69,7 +69,7 @@ def _warn_of_old_maps(command: Evaluate) -> None:
 
 def _check_checkpoints(paths: Sequence[Path]) -> None:
     """Raise InputError for one checkpoint under two names: it would count as two trainings."""
-    from csph.networks.model import checkpoint_file
+    from csph.networks.checkpoint import checkpoint_file
     from csph.weights.cards import checkpoint_of
 
     known: dict[Path, Path] = {}

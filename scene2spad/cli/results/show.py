@@ -174,7 +174,7 @@ def _model_facts(source: Path, card: Path) -> dict[str, object]:
         from csph.weights.cards import read_card
 
         return read_card(card).to_dict()
-    from csph.networks.model import load_model
+    from csph.networks.checkpoint import load_model
 
     model, config, state = load_model(source)
     return {"name": config.model.name, "parameters": model.parameters_count, **state, **_flat(config.to_dict())}

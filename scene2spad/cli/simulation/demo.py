@@ -94,7 +94,7 @@ def run(command: Demo, progress: Progress) -> dict:
 
 def chip_cost(model: str) -> str:
     """Say what a model's codes cost on emulated cores, or why they do not fit."""
-    from csph.networks.model import load_model
+    from csph.networks.checkpoint import load_model
     from csph.weights.cards import checkpoint_of
     from scene2spad.studies.chip.chain import measured
     from scene2spad.studies.chip.code import compile_model

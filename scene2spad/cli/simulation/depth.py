@@ -314,7 +314,7 @@ def _network(command: Depth) -> DepthModel | None:
         raise InputError("depth: --int8-rule goes with --int8")
     if not wanted:
         return None
-    from csph.networks.model import load_model
+    from csph.networks.checkpoint import load_model
     from csph.weights.cards import shipped_model
     from scene2spad.networks.end_warnings import warn_of_ends
 

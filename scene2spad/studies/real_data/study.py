@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from csph.networks.model import DepthModel, load_model
+from csph.networks.checkpoint import load_model
+from csph.networks.model import DepthModel
 from csph.weights.cards import checkpoint_of
 from render.engine import render
 from render.settings import RenderSettings
