@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 
 from render.ambient.integrator import AmbientLight, ambient_light
-from render.direct.integrator import centre_layers
+from render.direct.integrator import Layers, centre_layers
 from render.error import ErrorEstimate, is_met, is_ruled_by_bounces, is_ruled_by_few, target_verdict
 from render.image_error import estimated_error
 from render.indirect.schedule import Schedule, reallocated
@@ -27,11 +27,12 @@ from render.pipeline import (
     trace,
 )
 from render.planning import make_plan, pilot_pixels, refracting
+from render.scene.rays import TOUCHING
 from render.scene.traced_scene import TracedScene
 from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXEL_BYTES, Plan, RenderSettings
 from render.transient import Transient
 from render.transient.samples import to_returns
-from scenes.errors import told_apart
+from scenes.errors import require, told_apart
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.model import Scene
@@ -63,6 +64,7 @@ def render(
     a transient without returns. `progress(what, share)` is called between passes. The plan, its reasons, the error
     estimate and everything needed to repeat the render are in the transient's `meta`. `world` is the scene ready to
     trace, where it is there already, and `plan` what was planned for it, say before another camera in the same room.
+    Raises InputError for a camera that lies on a surface.
     """
     settings = settings or RenderSettings()
     report = progress or (lambda what, fraction: None)
@@ -70,9 +72,10 @@ def render(
     require_memory(MIN_PIXEL_BYTES * camera.width * camera.height, f"a render of {camera.width} x {camera.height}")
     world = refracting(TracedScene(scene) if world is None else world, settings)
     report("plan", 0.0)
+    layers = centre_layers(world)
+    _require_clear_view(world, layers)
     plan = planned(world, settings, seed) if plan is None else plan
     plan, traced, error = _traced_to_target(world, plan, settings, seed, report)
-    layers = centre_layers(world)
     # where nothing is in view there is nothing to explain
     for line in (*scene.notes, *plan.reasons) if len(traced.samples.pixel) else ():
         log.info("%s", line)
@@ -105,6 +108,16 @@ def render(
         error=noise.reshape(camera.height, camera.width).astype(np.float32),
         meta=_meta(scene, plan, seed, error, traced) | _of_ambient(plan, settings, ambient),
     )
+
+
+def _require_clear_view(world: TracedScene, layers: Layers) -> None:
+    """Raise InputError where a camera lies on a surface: on which side of it rays begin is up to rounding."""
+    camera = world.scene.camera
+    nearest_m = float(np.nanmin(layers.depth_m, initial=math.inf))
+    limit_m = TOUCHING * max(float(np.abs(corner - camera.origin).max()) for corner in world.scene.bounds())
+    at = ", ".join(f"{value:g}" for value in camera.origin)
+    near = f"lies on a surface, {abs(nearest_m):.2g} m before it; the limit is {limit_m:.2g} m here"
+    require(nearest_m > limit_m, f"scene {world.scene.name}: the camera at ({at}) {near}: move it off")
 
 
 def _traced_to_target(

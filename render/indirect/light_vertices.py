@@ -21,13 +21,21 @@ from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, UInts, Vectors
 from render.indirect.glossy import has_light_paths, ratio_at_laser
-from render.scene.rays import first_opaque, interaction_from_parts, laser_light, parts_of, segment, spawn, to_world
+from render.scene.rays import (
+    TOUCHING,
+    first_opaque,
+    interaction_from_parts,
+    laser_light,
+    parts_of,
+    segment,
+    spawn,
+    to_world,
+)
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 from scenes.model import Laser
 
 MAX_POINTS, POINTS_PER_PATH = 1 << 15, 1 / 8
 MIN_FAR_COSINE = 1e-9
-TOUCHING = 5e-7  # of the laser's largest coordinate, from the camera: what float32 hardly tells apart
 # Light vertices that x1 is connected to, of a path alone and of one that is reused: as many as lowered the noise of a
 # second most. Under a lamp, whose paths seldom meet what is close to it, later vertices are joined to one, too. A flash
 # lights what its pixels see, which paths meet often: there joining hardly pays.

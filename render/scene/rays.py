@@ -7,6 +7,9 @@ from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32,
 
 MAX_LAYERS = 64  # of glass and cut-outs that one ray passes
 MIN_SHADING_COSINE = 1e-4
+# Of the largest coordinate from the camera: float32 hardly tells apart what is closer.
+TOUCHING = 5e-7
+BEFORE_END = 1e-4  # of a ray's length: so far before its end nothing stops it
 
 
 def camera_rays(world: TracedScene, x: Floats, y: Floats, eye: Vectors = None) -> tuple[Array, Array]:
@@ -65,11 +68,13 @@ def spawn(si: Interactions, direction: Vectors) -> Array:
 
 
 def ray_to(si: Interactions, point: Vectors) -> Array:
-    """Return the ray from a surface to a little before a point, as on that a surface may lie."""
+    """Return the ray from a surface to a little before a point: not as far as a surface that the point may lie on, nor
+    as what a ray from there would miss."""
     start = spawn(si, point - si.p).o
     way = point - start
     length = dr.norm(way)
-    return mi.Ray3f(start, way / length, length * (1 - mi.math.ShadowEpsilon), 0, mi.Color0f())
+    short = length - dr.maximum(BEFORE_END * length, mi.math.RayEpsilon * dr.max(dr.abs(point)))
+    return mi.Ray3f(start, way / length, short, 0, mi.Color0f())
 
 
 def pane_transmittance(fresnel: Floats) -> Array:
@@ -273,12 +278,9 @@ def segment(
     ray = ray_to(si, point)
     if not world.sees_through:
         return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), distance
-    # not as far as a surface that the point may lie on, nor as what a ray from there would miss
-    length = dr.norm(point - ray.o)
-    short = length - dr.maximum(1e-4 * length, mi.math.RayEpsilon * dr.max(dr.abs(point)))
-    transmission, optical, shortening = passage(world, ray, ray.o, short, active, in_air=False)
+    transmission, optical, shortening = passage(world, ray, ray.o, ray.maxt, active, in_air=False)
     factor = spreading(distance, shortening) if spread else 1
-    return transmission * factor, optical + (distance - short)
+    return transmission * factor, optical + (distance - ray.maxt)
 
 
 def passage(

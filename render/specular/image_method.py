@@ -28,6 +28,7 @@ from render.specular.mirrors import (
     glint_sequences,
     image_of,
     image_sequences,
+    lit_mirrors,
     lobe_points,
     planes_of,
     specular_points,
@@ -69,10 +70,12 @@ def specular_light(
     mirrors, more = find_mirrors(world)
     notes += more
     tables = _Tables(world, mirrors, bounces)
-    parts = [no_samples()]
-    parts += [_glints(world, tables, mirrors, s) for s in glint_sequences(mirrors, notes) if s.shape[1] <= bounces]
+    parts, lit = [no_samples()], lit_mirrors(world, mirrors)
+    for sequences in glint_sequences(mirrors, notes):
+        if sequences.shape[1] <= bounces:
+            parts.append(_glints(world, tables, mirrors, sequences[lit[sequences[:, -1]]]))
     for sequence in image_sequences(mirrors, notes):
-        if len(sequence) < bounces:  # and the surface that is lit
+        if lit[sequence[-1]] and len(sequence) < bounces:  # and the surface that is lit
             parts += _mirrored(world, tables, mirrors, sequence, grid, allowed)
     return SpecularLight(merge(concatenate(parts), tolerance_m), tuple(notes))
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from render.scene.rays import TOUCHING
 from render.scene.traced_scene import TracedScene
 from scenes.errors import listed, require
 from scenes.model import Surface
@@ -132,6 +133,13 @@ def _add_plane(planes: list[tuple], plane: tuple) -> None:
             planes[i] = (n, c, np.minimum(a, low), np.maximum(b, high))
             return
     planes.append(plane)
+
+
+def lit_mirrors(world: TracedScene, mirrors: Mirrors) -> np.ndarray:
+    """Return which planes the laser shines on, (n,) bool: a lamp on a wall lights the room, and not the wall."""
+    camera = world.scene.camera
+    laser = world.scene.laser.position(camera) - camera.origin
+    return np.abs(mirrors.normal @ laser - mirrors.offset) > TOUCHING * np.abs(laser).max()
 
 
 def glint_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:

@@ -232,3 +232,38 @@ def test_a_lamp_on_a_wall_lights_the_room() -> None:
     edges_m = np.array([0.0, 100.0])
     direct, all_light = (path_traced(scene, edges_m, bounces=most, spp=256).sum() for most in (1, 3))
     assert found.radiance[found.bounces > 1].sum() == pytest.approx(all_light - direct, rel=0.02)
+
+
+def test_a_lamp_close_behind_a_panel_does_not_shine_through_it() -> None:
+    """The panel is 1 mm before the lamp, and 3 m from the wall that is in view."""
+    corners = np.array([(0.5, -1, -0.001), (2.5, -1, -0.001), (2.5, 1, -0.001), (0.5, 1, -0.001)], float)
+    panel = Surface(corners, FACES, WALLS, name="panel")
+    lamp = Laser(baseline_m=(1.5, 0, 0), cone_deg=180)
+    scene = Scene("panel", (oracles.wall(3.0, 0.5), panel), oracles.camera(8, 8, 20), lamp)
+    assert render(scene, RenderSettings(bounces=1, grid=4)).returns == 0
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_a_lamp_on_a_mirror_lights_nothing_by_way_of_it(turn: float) -> None:
+    """As one on a wall, it shines into the room alone; a tenth of a millimetre before the mirror it lights all twice,
+    less what the metal absorbs."""
+    turned = np.array([(np.cos(turn), -np.sin(turn), 0), (np.sin(turn), np.cos(turn), 0), (0, 0, 1)])
+    corners = np.array([(-2, 2, -2), (2, 2, -2), (2, 2, 3), (-2, 2, 3)], float)
+    mirror = Surface(corners @ turned.T, FACES, Material("conductor"), name="mirror")
+    wall, light = oracles.wall(-3.0, 0.7, half_size_m=1.5), []
+    for height_m in (2.0, 1.9999):
+        camera = looking((0, 0, 0), (0, 0, 1))
+        baseline_m = tuple(camera.rotation.T @ turned @ np.array([0.3, height_m, 1.2]))
+        scene = Scene("lamp", (wall, mirror), camera, Laser(baseline_m=baseline_m, cone_deg=360))
+        found = render(scene, RenderSettings(bounces=2, spp=4, grid=4), seed=1)
+        light.append([found.radiance[found.bounces == met].sum() for met in (1, 2)])
+    assert light[0][1] == 0 and light[1][1] == pytest.approx(light[0][0], rel=0.01)
+
+
+def test_a_camera_on_a_surface_is_refused() -> None:
+    """Which side of the floor its rays begin on would be up to rounding."""
+    for height_m in (-2.0, -2.0 + 1e-7):
+        with pytest.raises(InputError, match=r"^scene room: the camera at \(0, -2, 1\) lies on a surface, \S+ m before"):
+            render(Scene("room", (room(),), looking((0, height_m, 1), (0, height_m, -1))), RenderSettings(bounces=1, grid=2))
+    above = render(Scene("room", (room(),), looking((0, -1.9, 1), (0, -1.9, -1))), RenderSettings(bounces=1, grid=2))
+    assert above.depth_m.min() > 0.1
