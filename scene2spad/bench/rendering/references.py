@@ -18,7 +18,7 @@ from scenes.errors import InputError
 from scenes.files import read_arrays, whole_file
 
 log = logging.getLogger("scene2spad")
-FORMAT = 2  # of what is kept, renders of studies too: another number forgets them within a version
+FORMAT = 3  # of what is kept, renders of studies too: another number forgets them within a version
 FIRST_SEED = 1_000_000  # far from the seeds of what is judged
 
 
