@@ -51,7 +51,7 @@ def _inside(span: Span) -> slice:
 class DepthModel(nn.Module):
     """Counts (B, 1, T, R, C) -> logits (B, T, R, C); `seed` decides where weights begin.
 
-    `scene2spad.load_model` has an example.
+    `load_model` has an example.
 
     own       the codes of a design of own codes (`csph.codes.files.own_codes`)
     network   (B, 1, T, R, C) -> logits (B, T, R, C), in place of the one that the configuration names: a module whose
