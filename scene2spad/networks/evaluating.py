@@ -92,8 +92,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     plan = EvaluationPlan(levels, tile, command.offset, command.seed, command.law)
     keep = map_writer(unfinished.maps, methods) if command.maps else None
     found = evaluate(methods, views, sensor, plan, progress=progress, keep=keep)
-    if unfinished.taken:
-        log.info("%d depth maps of networks are those of an evaluation that was stopped", unfinished.taken)
+    unfinished.say()
     _report_plans(found, command.law)
     _warn_of_missing(found, groups)
     command.out.mkdir(parents=True, exist_ok=True)

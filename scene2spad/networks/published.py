@@ -30,6 +30,7 @@ from csph.networks.posterior import DECODERS, Decoder
 from csph.weights.cards import checkpoint_of
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec
 from scene2spad.networks.results import Store
+from scene2spad.networks.unfinished import Unfinished
 from scene2spad.options.networks import Evaluate
 from scenes.errors import InputError, require
 from scenes.files import write_csv
@@ -215,13 +216,18 @@ def sensed_pair(pair: Pair, level: tuple[float, float], offset_m: float, key: tu
 
 
 def errors_as_published(model: DepthEstimator, histogram: Histogram, decoder: Decoder) -> dict[str, float]:
-    """Compare a model with the published label and with the pulse's arrival: MAE, RMSE [mm], share within 10 mm.
+    """Compare a model with the published label and with the pulse's arrival, as `depth_errors_as_published` does."""
+    depth, _ = model.depth_of(histogram, decoder=decoder)
+    return depth_errors_as_published(depth, histogram)
+
+
+def depth_errors_as_published(depth_m: np.ndarray, histogram: Histogram) -> dict[str, float]:
+    """Compare a depth map with the published label and with the pulse's arrival: MAE, RMSE [mm], share within 10 mm.
 
     Models of the published grid know the label alone: their columns of the arrival mean nothing.
     """
     sensor = histogram.sensor
-    depth, _ = model.depth_of(histogram, decoder=decoder)
-    bins = depth.astype(np.float64) / sensor.bin_depth_m
+    bins = depth_m.astype(np.float64) / sensor.bin_depth_m
     step_m = PUBLISHED_SPEED_OF_LIGHT_M_PER_S * sensor.bin_width_s / 2
     early = published_centroid_bins(sensor)  # in bins after the fullest
     found: dict[str, float] = {}
@@ -233,26 +239,33 @@ def errors_as_published(model: DepthEstimator, histogram: Histogram, decoder: De
 
 
 def evaluate_as_published(
-    models: Mapping[str, DepthModel], *, seed: int = 0, offset_m: float = 0.0, progress: Progress
+    models: Mapping[str, DepthModel],
+    unfinished: Unfinished,
+    *,
+    seed: int = 0,
+    offset_m: float = 0.0,
+    progress: Progress,
 ) -> list[dict[str, object]]:
     """Evaluate models on the paper's pairs in its own simulation, a row a model, pair, level and decoder.
 
     `reference` is what a model is compared with: the published label for models of the published grid, the pulse's
-    arrival for ours, whose labels are centred on the pulse. Raises InputError where no pair is found.
+    arrival for ours, whose labels are centred on the pulse. `unfinished` keeps estimates until the caller ends it.
+    Raises InputError where no pair is found.
     """
     photographs, rows = pairs(), []
+    ways = [(name, decoder) for name in models for decoder in DECODERS]
+    methods = {(name, decoder): unfinished.method(models[name], [], decoder=decoder) for name, decoder in ways}
     for number, pair in enumerate(photographs):
         for place, level in enumerate(PHOTON_LEVELS):
             progress(f"{pair.name}, {level[0]:g} + {level[1]:g}", number / len(photographs))
             histogram = sensed_pair(pair, level, offset_m, (seed, number, place))
-            for name, model in models.items():
-                reference = "label" if model.config.grid == "published" else "arrival"
-                for decoder in DECODERS:
-                    errors = errors_as_published(model, histogram, decoder)
-                    common = {"model": name, "pair": pair.name, "signal": level[0], "background": level[1]}
-                    common |= {"decoder": decoder, "reference": reference}
-                    kept = {figure: errors[f"{figure}_{reference}"] for figure in ("mae_mm", "rmse_mm", "within_10mm")}
-                    rows.append({**common, **kept, "mae_mm_label": errors["mae_mm_label"]})
+            for (name, decoder), method in methods.items():
+                reference = "label" if models[name].config.grid == "published" else "arrival"
+                errors = depth_errors_as_published(method(histogram), histogram)
+                common = {"model": name, "pair": pair.name, "signal": level[0], "background": level[1]}
+                common |= {"decoder": decoder, "reference": reference}
+                kept = {figure: errors[f"{figure}_{reference}"] for figure in ("mae_mm", "rmse_mm", "within_10mm")}
+                rows.append({**common, **kept, "mae_mm_label": errors["mae_mm_label"]})
     return rows
 
 
@@ -276,9 +289,12 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     require(kept, "evaluate: --baselines does not go with --set published, which is of networks alone")
     for model in named.values():
         model.config.sensor.check_offset(command.offset)
-    rows = evaluate_as_published(named, seed=command.seed, offset_m=command.offset, progress=progress)
+    unfinished = Unfinished(command.out / "unfinished")
+    rows = evaluate_as_published(named, unfinished, seed=command.seed, offset_m=command.offset, progress=progress)
+    unfinished.say()
     command.out.mkdir(parents=True, exist_ok=True)
     table = write_csv(rows, command.out / "evaluation-published.csv")
+    unfinished.end()
     return {"means": format_published(rows), "csv": str(table)} | ({"rows": rows} if command.json else {})
 
 

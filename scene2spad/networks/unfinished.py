@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +19,8 @@ from scene2spad.networks.training import network_method
 from scenes.errors import InputError
 from scenes.files import link_target, read_arrays, whole_file
 from spad.measurements.histogram import Histogram
+
+log = logging.getLogger("scene2spad")
 
 
 class Unfinished:
@@ -54,7 +57,12 @@ class Unfinished:
 
         return method
 
-    def end(self, maps: Path | None) -> None:
+    def say(self) -> None:
+        """Log how many depth maps were those of an evaluation that was stopped, if any were."""
+        if self.taken:
+            log.info("%d depth maps of networks are those of an evaluation that was stopped", self.taken)
+
+    def end(self, maps: Path | None = None) -> None:
         """Remove what was kept, and move the maps to their place; InputError where that cannot be written."""
         shutil.rmtree(self._estimates, ignore_errors=True)
         try:

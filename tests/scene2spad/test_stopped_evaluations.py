@@ -3,12 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from csph.networks.model import DepthModel
 from render.transient.packs import write_pack
 from scene2spad.cli import main
 from scene2spad.datasets.planes import wall
+from scene2spad.networks import published
 from scene2spad.networks.evaluating import run_evaluate
 from scene2spad.options.networks import Evaluate
 
@@ -77,6 +79,30 @@ def test_a_stopped_evaluation_goes_on_with_the_same_table(estimates, caplog):
     assert len(estimates) == 2 * OF_NETWORKS and "12 depth maps of networks are those of" in caplog.text
     assert files(Path("stopped")) == files(Path("whole"))
     assert {**found, "csv": "", "maps": ""} == {**whole, "csv": "", "maps": ""}
+
+
+def test_one_on_the_published_pairs_goes_on_with_the_same_table(estimates, monkeypatch):
+    """Two pairs at two levels, by both decoders; the first run stops before its fourth exposure."""
+    rng = np.random.default_rng(5)
+    made_up = [published.Pair(f"made-up {n}", *(0.2 + rng.random((2, 16, 16)))) for n in range(2)]
+    monkeypatch.setattr(published, "pairs", lambda count=None: made_up)
+    monkeypatch.setattr(published, "PHOTON_LEVELS", ((50.0, 50.0), (10.0, 50.0)))
+    command = replace(COMMAND, set=Path("published"), baselines=(), levels=(), int8=False, maps=False)
+    whole = published.run_evaluate(command, ignored)
+    an_exposure = 2 * 2  # networks and decoders
+    assert len(estimates) == 4 * an_exposure
+    stopped, begun = replace(command, out=Path("stopped")), []
+
+    def progress(what: str, fraction: float | None) -> None:
+        begun.append(what)
+        if len(begun) > 3:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        published.run_evaluate(stopped, progress)
+    assert len(estimates) == 7 * an_exposure and not Path("stopped/evaluation-published.csv").exists()
+    assert {**published.run_evaluate(stopped, ignored), "csv": ""} == {**whole, "csv": ""}
+    assert len(estimates) == 8 * an_exposure and files(Path("stopped")) == files(Path("whole"))
 
 
 def test_what_other_options_left_does_no_harm(estimates):
