@@ -49,6 +49,7 @@ def commands() -> list[list[str]]:
     return [shlex.split(line) for line in lines]
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_page_run_on_the_changed_tree(changed, tmp_path):
     asked = commands()
     assert len(asked) == 6

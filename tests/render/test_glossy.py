@@ -105,7 +105,7 @@ def check_both_ways(scene: Scene, off: Callable[[], None], most_noise: float) ->
 
 
 @pytest.mark.parametrize("smooth", [False, True], ids=["facets", "smooth"])
-@pytest.mark.parametrize("laser", LASERS)
+@pytest.mark.parametrize("laser", ["flash", *(pytest.param(one, marks=pytest.mark.slow) for one in [*LASERS][1:])])
 @pytest.mark.parametrize("material", [METAL, GLOSS], ids=["metal", "gloss"])
 def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, mis_weight_sampled):
     scene = room(material, LASERS[laser], smooth=smooth)
@@ -189,7 +189,7 @@ def test_nothing_begins_elsewhere(scene, why):
     assert glossy_of(world) is None and not list(trace_light_paths(world, 4, 1, 3, 0)), why
 
 
-@pytest.mark.parametrize("cone_deg", [360, 200, 130])
+@pytest.mark.parametrize("cone_deg", [200, *(pytest.param(one, marks=pytest.mark.slow) for one in (130, 360))])
 def test_polished_things_behind_the_camera(cone_deg, mis_weight_sampled):
     """A wide laser lights metal that no pixel shows: what it throws on the walls is found from there. 130 degrees do
     not reach it, and begin on the ball alone."""

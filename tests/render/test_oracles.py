@@ -148,7 +148,7 @@ def diffuse_room(laser: Laser) -> Scene:
     return Scene("box", (room, top, ball), oracles.camera(24, 18, 60), laser)
 
 
-@pytest.mark.parametrize("bounces", [1, 3])
+@pytest.mark.parametrize("bounces", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_energy_equals_mitsuba_steady_render(bounces):
     """Summed over time, laser light is what Mitsuba's path tracer gives for a point light of intensity 1/(4 pi)."""
     scene = diffuse_room(Laser("flood", cone_deg=360))

@@ -189,7 +189,10 @@ def bright_sphere(size: int) -> Scene:
     return replace(scene, surfaces=surfaces, camera=replace(scene.camera, width=size, height=size))
 
 
-@pytest.mark.parametrize(("name", "spp", "taken"), [("hall", 64, False), ("room", 16, False), ("sphere", 16, True)])
+@pytest.mark.parametrize(
+    ("name", "spp", "taken"),
+    [pytest.param("hall", 64, False, marks=pytest.mark.slow), ("room", 16, False), ("sphere", 16, True)],
+)
 def test_left_out_where_it_hurts(name, spp, taken):
     """A stairwell under a flash owes its noise to gloss, which no filter takes: with 64 paths it had 0.15 instead of
     0.07 of error. In a diffuse room neighbours share paths, which leaves a filter little. In a closed bright sphere

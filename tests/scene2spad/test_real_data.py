@@ -49,6 +49,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_smoke_study_draws_every_figure_and_goes_on_from_what_is_there(capfd, folder):
     checkpoint(folder / "learned.safetensors")
     checkpoint(folder / "counts.safetensors", front="counts")

@@ -27,6 +27,7 @@ def small(tmp_path) -> Path:
     return tmp_path / "set"
 
 
+@pytest.mark.slow
 def test_a_place_that_was_planned_without_ambient_light_is_rendered_without(tmp_path):
     """Planning had left the last place's world behind with its lamps, and the first view after it was lit by them."""
     job, out = Job("rooms", width=8, bounces=1, error=0.3, ambient=False), tmp_path / "set"
