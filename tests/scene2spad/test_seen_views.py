@@ -34,7 +34,7 @@ def test_a_test_on_views_of_training_says_so(capfd, packed, trained, tmp_path):
 
 
 def test_a_set_that_is_given_under_two_names_is_refused(capfd, packed, tmp_path):
-    """Its views were drawn twice as often as those of others, without a word."""
+    """Refuse what was taken without a word, and had its views drawn twice as often as others."""
     again, out = pack(read_views(packed), tmp_path / "again.h5", grid=4), tmp_path / "run"
     others = str(pack(random_planes(3, size=16, seed=9), tmp_path / "others.h5"))
     cure = "; --set-weights says how often a set is drawn from"
