@@ -154,7 +154,7 @@ def test_images_that_blocks_do_not_tile(size):
 
 
 def test_a_network_that_sees_no_photon_is_not_sure():
-    """Without one it answers what training made likely; it was up to 64 % sure of that. Photons at its side count."""
+    """Without one it answers what training made likely; it was up to 69 % sure of that. Photons at its side count."""
     network = DepthModel(ModelConfig(design=Design("learned", (32, 4, 4), 8), sensor=SMALL), 2).eval()
     histogram = sense(random_planes(1, size=64, seed=2).transients[0], SMALL, PhotonBudget(20, 5), seed=1)
     counts = np.zeros_like(histogram.counts)
