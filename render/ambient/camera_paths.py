@@ -8,7 +8,7 @@ that begin there (`render.ambient.light_paths`), unless the camera, too, sees wh
 
 from __future__ import annotations
 
-from render.ambient.panes import has_lit_mirrors, mirrored_direction, pane_event, straight_transmission
+from render.ambient.panes import has_lit_mirrors, mirrored_direction, pane_event, shines, straight_transmission
 from render.backend.drjit_types import Array, Floats, Masks, Rays, UInts
 from render.scene.rays import MAX_LAYERS, camera_rays, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
@@ -60,7 +60,8 @@ def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple
         chosen = active & (density > 0) & (emitter != None)  # noqa: E711 (an array of pointers)
         of_lights = scene.pdf_emitter_direction(before, to_light, chosen)
         fraction = dr.select(chosen, density / (density + of_lights), 1)
-        found = dr.select(active, weight * fraction * emitter.eval(si, active)[0], 0)
+        there = active & shines(world, si.shape, si, active & si.is_valid())
+        found = dr.select(there, weight * fraction * emitter.eval(si, active)[0], 0)
         if dr.hint(has_lit_mirrors(world), mode="scalar"):
             found = dr.select(si.is_valid() & mirrored & scattered & ~mirrored_first, 0, found)
         seen += dr.select(met == 0, found, 0)
@@ -74,6 +75,7 @@ def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple
         lit = surface & going_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         sample, emitted = scene.sample_emitter_direction(si, sampler.next_2d(lit), False, lit)
         lit &= sample.pdf > 0
+        lit &= shines(world, sample.emitter.get_shape(), sample, lit)
         value, of_bsdf = bsdf.eval_pdf(context, si, si.to_local(sample.d), lit)
         lit &= value[0] > 0
         fraction = dr.select(sample.delta, 1, sample.pdf / (sample.pdf + of_bsdf))

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from render.ambient.camera_paths import SETS, survival
-from render.ambient.panes import mirrored_direction, pane_event, straight_transmission
+from render.ambient.panes import mirrored_direction, pane_event, shines, straight_transmission
 from render.backend.drjit_types import Array, Floats, Generators, UInts
 from render.indirect.path_cells import scatter_add_fixed_point
 from render.scene.rays import MAX_LAYERS, pixel_of, shading_ratio, spawn, to_camera
@@ -73,6 +73,8 @@ def _trace(world: TracedScene, random: Generators, row: UInts, most: UInts, scal
     ray, power, emitter = scene.sample_emitter_ray(0, random.next_float32(), way, where, Bool(True))
     ray, start = mi.Ray3f(ray), power[0]
     active = (start > 0) & ~mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+    begin = emitter.sample_position(0, way, active)[0]  # by the number that placed the ray
+    active &= shines(world, emitter.get_shape(), begin, active)
     weight = dr.full(Float, 1, lanes)  # of the reflectance so far
     met, layer, by_mirror = dr.zeros(UInt32, lanes), dr.zeros(UInt32, lanes), dr.full(Bool, False, lanes)
     while active:

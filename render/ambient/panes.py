@@ -29,6 +29,16 @@ def pane_event(world: TracedScene, si: Interactions, ray: Rays, sample: LobeSamp
     return passing, mirrored
 
 
+def shines(world: TracedScene, shape: Array, place: Interactions | LobeSamples, active: Masks) -> Array:
+    """Return whether a lamp shines at a place of its shape, or a sample there: the holes of a cut-out are dark."""
+    if not world.has_cutouts:
+        return Bool(True)
+    there = dr.zeros(mi.SurfaceInteraction3f, dr.width(place.uv))
+    there.uv = place.uv
+    on_shape = active & (shape != None)  # noqa: E711 (an array of pointers)
+    return ~on_shape | (shape.eval_attribute_1(OPACITY, there, on_shape) >= 0.5)
+
+
 def mirrored_direction(ray: Rays, si: Interactions) -> Array:
     """Return the direction of a ray that a plane face mirrors."""
     return ray.d - 2 * dr.dot(ray.d, si.n) * si.n

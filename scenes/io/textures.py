@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ Colour = tuple[float, float, float]  # linear RGB
 WHITE: Colour = (1.0, 1.0, 1.0)
 MAX_PIXELS = 1 << 26
 SHARP_PIXELS = 1024  # side up to which images without interpolation are enlarged
+# By Pillow's name of a layout of 16 bits a colour, the one under which it keeps the lower bytes.
+_LOWER_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L", "LA;16B": "RGBA"}
 MAX_EXR_VALUES = 1 << 27  # of all channels: 8192 x 4096 RGBA, 1 GiB as float64
 
 
@@ -84,10 +87,11 @@ def image_values(image: Image.Image, *, linear: bool = False, channel: str = "lu
     if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV", "1"):
         image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
     bands = image.getbands()
-    values = np.asarray(image)
+    values = _levels_of_16_bits(image)
+    values = np.asarray(image) if values is None else values
     values = values.reshape(*values.shape[:2], -1)
     alpha = channel == "alpha" and bands[-1] == "A"
-    values = values[..., -1:] if alpha else values[..., : 3 if len(bands) >= 3 else 1]
+    values = values[..., -1:] if alpha else values[..., : 3 if values.shape[2] >= 3 else 1]
     if values.dtype in (np.uint8, np.uint16):
         # by table, in float32: a large image must not become many times its size
         levels = np.arange(np.iinfo(values.dtype).max + 1) / np.iinfo(values.dtype).max
@@ -95,6 +99,31 @@ def image_values(image: Image.Image, *, linear: bool = False, channel: str = "lu
         return table[values]
     values = values / (65535 if bands == ("I",) else 1)
     return values if linear or alpha else srgb_to_linear(values)
+
+
+def _levels_of_16_bits(image: Image.Image) -> np.ndarray | None:
+    """Return all bits (h, w, channels) of a PNG of 16 bits a colour; None of another image, or one decoded already.
+
+    Pillow drops the lower byte of such colours: a dark one loses up to a fifth. Other names of the layout of the same
+    bytes give it.
+    """
+    from PIL.PngImagePlugin import PngImageFile
+
+    if not isinstance(image, PngImageFile) or not image.tile or image.fp is None:
+        return None
+    layout = image.tile[0].args
+    if not isinstance(layout, str) or layout not in _LOWER_BYTES:
+        return None
+    at = image.fp.tell()
+    image.fp.seek(0)
+    content = io.BytesIO(image.fp.read())
+    image.fp.seek(at)
+    with PngImageFile(content) as other:
+        other.tile = [other.tile[0]._replace(args=_LOWER_BYTES[layout])]
+        lower = np.asarray(other)
+    if layout == "LA;16B":  # both bytes of both channels
+        return lower[..., ::2].astype(np.uint16) << 8 | lower[..., 1::2]
+    return np.asarray(image).astype(np.uint16) << 8 | lower
 
 
 @contextmanager

@@ -101,6 +101,8 @@ class Shapes:
         if look.inside_out:
             mesh = _turned(mesh)
         emission = self._emission(plugin, self._materials)
+        if emission > 0 and look.material.has_holes:
+            plugin.note("the holes of the lamp's mask are dark, in Mitsuba they shine")
         plugin.note_unused()
         uv = _project_uv(mesh.uv, look)
         try:
