@@ -47,6 +47,7 @@ class Part:
     visual: Visuals
     colours: np.ndarray | None = None  # of a PLY, or beside the material of a GLB
     coloured: str = "vertex"  # what has them
+    as_read: tuple[np.ndarray, np.ndarray] | None = None  # vertices and faces before any was dropped, as colours count
 
 
 class Paint:
@@ -149,7 +150,8 @@ class Paint:
         most = np.iinfo(colours.dtype).max if colours.dtype.kind in "iu" else 1
         colours = np.clip(colours / most, 0, 1)
         self.notes.append(f"{part.name}: one mean albedo in place of its colours per {part.coloured}")
-        return np.mean(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours), axis=0)
+        linear = colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours)
+        return np.asarray(np.average(linear, axis=0, weights=_areas(part, part.coloured, len(colours))))
 
     def _vertex_colour(self, part: Part) -> float | None:
         """Average the colours stored per vertex or face (linear in glTF, sRGB elsewhere); None where there are none."""
@@ -158,7 +160,23 @@ class Paint:
             return None
         colours = np.asarray(part.visual.vertex_colors if kind == "vertex" else part.visual.face_colors)[:, :3] / 255
         self.notes.append(f"{part.name}: one mean albedo in place of its colours per {kind}")
-        return float(luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours)).mean())
+        bright = luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours))
+        return float(np.average(bright, weights=_areas(part, kind, len(colours))))
+
+
+def _areas(part: Part, coloured: str, colours: int) -> np.ndarray | None:
+    """Return the area that each vertex or face has colour on, (colours,): a third of a face at each of its corners.
+
+    None, for a plain mean, where it is not known which face has which colour, as of polygons, or all areas are 0.
+    """
+    if part.as_read is None:
+        return None
+    vertices, faces = part.as_read
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    if coloured == "vertex":
+        areas = np.bincount(faces.ravel(), np.repeat(areas / 3, 3), len(vertices))
+    return areas if len(areas) == colours and areas.any() else None
 
 
 def _file_albedo(path: Path) -> Texture:

@@ -177,7 +177,8 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
     colours, coloured = beside.vertex_attributes.get("color"), "vertex"
     if "_ply_raw" in mesh.metadata:  # trimesh keeps the last eight bits of a colour alone
         colours, coloured = ply_colours(mesh.metadata["_ply_raw"])
-    return Part(name, shapes.transform(vertices, pose), faces, uv, normals, mesh.visual, colours, coloured)
+    vertices = shapes.transform(vertices, pose)
+    return Part(name, vertices, faces, uv, normals, mesh.visual, colours, coloured, (vertices, faces))
 
 
 def _check_pose(pose: np.ndarray, name: str) -> None:
