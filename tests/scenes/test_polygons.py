@@ -1,4 +1,4 @@
-"""Polygons of an .obj with dents: what is outside of them stays empty."""
+"""Polygons of an .obj or .ply with dents: what is outside of them stays empty."""
 
 from __future__ import annotations
 
@@ -40,6 +40,39 @@ def test_a_polygon_with_a_dent_keeps_its_area_and_coordinates(tmp_path: Path, fi
     (surface,) = load_mesh(tmp_path / "a.obj", placing=Placing(scale=1, bare=True)).surfaces
     assert area(surface) == pytest.approx(3 * np.sqrt(2))
     assert np.ptp(surface.vertices[:, 0] - surface.uv[:, 0]) == pytest.approx(0, abs=1e-9)
+
+
+APART = np.array([(5, 0), (6, 0), (5, 1)], float)  # a triangle of area 1/2
+
+
+def ply(outline: np.ndarray, *, binary: bool, mixed: bool) -> bytes:
+    """Write one polygon in the plane x + z = 0, with a normal at each corner, and a triangle beside it if `mixed`."""
+    points = np.concatenate((outline, APART)) if mixed else outline
+    faces = [[*range(len(outline))], [*range(len(outline), len(points))]][: 1 + mixed]
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    kind = "binary_little_endian" if binary else "ascii"
+    header = f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n{names}element face {len(faces)}\n"
+    header += "property list uchar int vertex_indices\nend_header\n"
+    rows = np.column_stack((points, -points[:, 0], np.tile((0.6, 0, 0.8), (len(points), 1)))).astype("<f4")
+    if binary:
+        lists = [bytes([len(face)]) + np.array(face, "<i4").tobytes() for face in faces]
+        return header.encode() + rows.tobytes() + b"".join(lists)
+    lines = [" ".join(map(str, row)) for row in [*rows.tolist(), *([len(face), *face] for face in faces)]]
+    return (header + "\n".join(lines) + "\n").encode()
+
+
+@pytest.mark.parametrize("first", range(6))
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize(("binary", "mixed"), [(True, False), (False, False), (False, True)])
+def test_a_polygon_of_a_ply_with_a_dent_keeps_its_area_and_normals(
+    tmp_path: Path, first: int, order: int, binary: bool, mixed: bool
+) -> None:
+    outline = np.roll(ELL[::order], first, axis=0)
+    (tmp_path / "a.ply").write_bytes(ply(outline, binary=binary, mixed=mixed))
+    (surface,) = load_mesh(tmp_path / "a.ply", placing=Placing(scale=1, bare=True)).surfaces
+    assert area(surface) == pytest.approx((3.5 if mixed else 3) * np.sqrt(2), rel=1e-5)
+    assert surface.normals is not None
+    np.testing.assert_allclose(surface.normals, np.tile((0.6, 0, 0.8), (len(surface.vertices), 1)), atol=1e-6)
 
 
 def test_stars_of_any_shape_are_cut_into_triangles_of_one_sense() -> None:

@@ -24,7 +24,9 @@ from scenes.io.mesh_formats.mesh_files import (
     check_vertices,
     load_trimesh,
 )
-from scenes.io.mesh_formats.ply import ply_colours
+from scenes.io.mesh_formats.ply import ply_colours, ply_points, ply_polygons
+from scenes.io.mesh_formats.polygons import cut_dents
+from scenes.json_types import JsonObject
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing
 
@@ -162,6 +164,8 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     check_faces(faces, len(vertices), name)
     check_vertices(vertices, name)
+    if "_ply_raw" in mesh.metadata:
+        faces = _without_dents(mesh.metadata["_ply_raw"], vertices, faces)
     _check_pose(pose, name)
     uv = getattr(mesh.visual, "uv", None)
     uv = None if uv is None or np.shape(uv) != (len(vertices), 2) or not np.isfinite(uv).all() else np.asarray(uv)
@@ -179,6 +183,16 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
         colours, coloured = ply_colours(mesh.metadata["_ply_raw"])
     vertices = shapes.transform(vertices, pose)
     return Part(name, vertices, faces, uv, normals, mesh.visual, colours, coloured, (vertices, faces))
+
+
+def _without_dents(elements: JsonObject, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the triangles of a PLY with its dented polygons cut otherwise than into a fan; not where trimesh has split
+    vertices."""
+    polygons = ply_polygons(elements)
+    if not polygons or not np.array_equal(ply_points(elements), vertices):
+        return faces
+    cut = cut_dents(vertices, polygons)
+    return faces if cut is None else cut
 
 
 def _check_pose(pose: np.ndarray, name: str) -> None:

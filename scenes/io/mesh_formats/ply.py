@@ -1,4 +1,4 @@
-"""Check a PLY against its header."""
+"""Check a PLY against its header, and read of it what trimesh reads otherwise."""
 
 from __future__ import annotations
 
@@ -170,6 +170,26 @@ def _end_of_binary(content: bytes, start: int, element: _Element, order: str) ->
         even = all((counts == counts[0]).all() for counts in lists)
         require(even, f"elements {element.name!r} have lists of different lengths, which is read from text alone")
     return end
+
+
+def ply_polygons(elements: JsonObject) -> list[np.ndarray]:
+    """Return the polygons of a PLY, as trimesh read it, by their corners; none where all are triangles."""
+    data = elements.get("face", {}).get("data", {})
+    names = data if isinstance(data, dict) else data.dtype.names or ()
+    for name in ("vertex_index", "vertex_indices"):
+        if name in names:
+            rows = data[name] if isinstance(data, dict) else data[name]["f1"]
+            if np.shape(rows)[1:] == (3,):
+                return []
+            polygons = [np.asarray(row, np.int64) for row in rows if np.ndim(row) == 1 and len(row) > 2]
+            return polygons if any(len(one) > 3 for one in polygons) else []
+    return []
+
+
+def ply_points(elements: JsonObject) -> np.ndarray:
+    """Return the vertices (n, 3) of a PLY, as trimesh read it."""
+    data = elements["vertex"]["data"]
+    return np.column_stack([np.asarray(data[axis], np.float64).ravel() for axis in "xyz"])
 
 
 def ply_colours(elements: JsonObject) -> tuple[np.ndarray | None, str]:

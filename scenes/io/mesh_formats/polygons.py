@@ -1,4 +1,4 @@
-"""Cut polygons of an OBJ with dents into triangles: a fan from their first corner covers what is outside of them."""
+"""Cut polygons of an OBJ or a PLY with dents into triangles: a fan from their first corner covers what is outside."""
 
 from __future__ import annotations
 
@@ -36,6 +36,18 @@ def without_dents(content: bytes) -> bytes:
         parts += [content[end : faces[number].start()], b"\n".join(rows)] if rows else []
         end = faces[number].end() if rows else end
     return b"".join((*parts, content[end:]))
+
+
+def cut_dents(points: np.ndarray, polygons: list[np.ndarray]) -> np.ndarray | None:
+    """Return triangles (m, 3) of polygons, each the indices of its corners among points (n, 3); None where a fan from
+    the first corner of each is right. Polygons that cross themselves, or are too large, stay fans."""
+    ends = np.cumsum([*map(len, polygons)])
+    dented = {*_dented(points, np.concatenate(polygons), ends)}
+    cut = [cut_polygon(points[polygons[number]]) if number in dented else [] for number in range(len(polygons))]
+    if not any(cut):
+        return None
+    fans = [found or [(0, i, i + 1) for i in range(1, len(one) - 1)] for found, one in zip(cut, polygons, strict=True)]
+    return np.concatenate([one[np.reshape(found, (-1, 3))] for found, one in zip(fans, polygons, strict=True)])
 
 
 def _dented(points: np.ndarray, indices: np.ndarray, ends: np.ndarray) -> list[int]:
