@@ -51,7 +51,8 @@ def load_texture(path: Path, *, linear: bool = False, channel: str = "luminance"
     """Read an image file (.png .jpg .bmp .tga .tif through Pillow, .exr through OpenEXR) as a linear texture.
 
     `linear` says that the numbers of an 8- or 16-bit file are linear already, else they are taken as sRGB (.exr is
-    always linear). `channel` is "luminance", or "alpha" for the alpha channel (luminance where there is none).
+    always linear, and so are fractions in a .tif). `channel` is "luminance", or "alpha" for the alpha channel
+    (luminance where there is none).
     `tint` is a linear colour that the image is multiplied by.
     Raises InputError naming the file when it is missing, broken or of another type.
     """
@@ -97,6 +98,7 @@ def image_values(image: Image.Image, *, linear: bool = False, channel: str = "lu
         levels = np.arange(np.iinfo(values.dtype).max + 1) / np.iinfo(values.dtype).max
         table = (levels if linear or alpha else srgb_to_linear(levels)).astype(np.float32)
         return table[values]
+    linear = linear or values.dtype.kind == "f"  # as fractions are in all formats that have them
     values = values / (65535 if bands == ("I",) else 1)
     return values if linear or alpha else srgb_to_linear(values)
 

@@ -1,4 +1,4 @@
-"""Images of 16 bits a colour keep all of their bits, which Pillow alone would cut to 8."""
+"""Images of more than 8 bits: of 16 bits a colour, which Pillow alone would cut to 8, and of fractions."""
 
 import struct
 import zlib
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from scenes.io.textures import load_texture, luminance, srgb_to_linear
 
@@ -40,3 +41,10 @@ def test_levels_of_16_bits_are_shares_of_65535(tmp_path: Path, channels: int, li
     if channels in (2, 4):
         alpha = load_texture(tmp_path / "deep.png", channel="alpha")
         np.testing.assert_allclose(alpha.image, shares[..., -1], rtol=1e-6)
+
+
+def test_fractions_of_a_tif_are_linear_as_those_of_an_exr(tmp_path: Path) -> None:
+    """They were taken as sRGB: half of white as 0.21 of it."""
+    values = np.random.default_rng(1).random((4, 6), np.float32)
+    Image.fromarray(values).save(tmp_path / "fractions.tif")
+    np.testing.assert_array_equal(load_texture(tmp_path / "fractions.tif").image, values)
