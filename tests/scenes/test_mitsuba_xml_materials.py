@@ -147,6 +147,13 @@ def test_an_opacity_that_is_rounded_is_noted(tmp_path: Path, opacity: str, taken
     assert [f"opacity {opacity} is taken as {taken}" in note for note in notes] == ([] if taken is None else [True])
 
 
+@pytest.mark.parametrize("opacity", [0, 1])
+def test_holes_of_a_lamp_are_noted_as_mitsuba_lets_them_shine(tmp_path: Path, opacity: int) -> None:
+    bsdf = f'<bsdf type="mask"><float name="opacity" value="{opacity}"/><bsdf type="diffuse"/></bsdf>'
+    notes = load(tmp_path, f'<shape type="rectangle">{bsdf}<emitter type="area"/></shape>').notes
+    assert any("holes of the lamp" in note for note in notes) == (opacity == 0)
+
+
 @pytest.mark.parametrize(
     ("steps", "noted"),
     [
