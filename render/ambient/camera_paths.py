@@ -74,8 +74,7 @@ def _traced(world: TracedScene, sampler: Array, ray: Rays, most: UInts) -> tuple
         going_on = met + 1 < most
         lit = surface & going_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         sample, emitted = scene.sample_emitter_direction(si, sampler.next_2d(lit), False, lit)
-        lit &= sample.pdf > 0
-        lit &= shines(world, sample.emitter.get_shape(), sample, lit)
+        lit &= (sample.pdf > 0) & shines(world, sample.emitter.get_shape(), sample, lit)
         value, of_bsdf = bsdf.eval_pdf(context, si, si.to_local(sample.d), lit)
         lit &= value[0] > 0
         fraction = dr.select(sample.delta, 1, sample.pdf / (sample.pdf + of_bsdf))
