@@ -106,8 +106,8 @@ def image_values(image: Image.Image, *, linear: bool = False, channel: str = "lu
 def _levels_of_16_bits(image: Image.Image) -> np.ndarray | None:
     """Return all bits (h, w, channels) of a PNG of 16 bits a colour; None of another image, or one decoded already.
 
-    Pillow drops the lower byte of such colours: one of 2 % of white loses a sixth. Other names of the layout of the same
-    bytes give it.
+    Pillow drops the lower byte of such colours: one of 2 % of white loses a sixth. Other names of the layout of the
+    same bytes give it.
     """
     from PIL.PngImagePlugin import PngImageFile
 
