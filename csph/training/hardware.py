@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+import signal
+import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytorch_lightning as pl
+from lightning_fabric.plugins.environments import LightningEnvironment
 
 from csph.networks.config import TrainConfig
 from csph.training.resume import WholeFileCheckpoints
@@ -39,6 +42,20 @@ class Hardware:
 ANY_HARDWARE = Hardware()
 
 
+class _SignalsOfTheCaller(pl.Callback):
+    """Leave SIGTERM to who began the training: Lightning ends a run by it where it is ignored, too, and where it has no
+    handler makes a Ctrl-C of it, at the next step."""
+
+    before: signal.Handlers | int | Callable[..., object] | None = None
+
+    def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self.before = signal.getsignal(signal.SIGTERM)
+
+    def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        if self.before is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self.before)
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence Lightning's advice on workers and devices, which is not the user's business: what is said here goes to
@@ -63,13 +80,14 @@ def trainer_on(hardware: Hardware, config: TrainConfig, callbacks: Sequence[pl.C
         runner = pl.Trainer(
             max_epochs=config.epochs,
             precision=config.precision,
-            callbacks=[*callbacks],
+            callbacks=[_SignalsOfTheCaller(), *callbacks],
             logger=False,
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
             num_sanity_val_steps=0,
-            plugins=[WholeFileCheckpoints()],
+            # a job of several tasks (Slurm) is not one training on all of them, nor is it put back into the queue here
+            plugins=[WholeFileCheckpoints(), LightningEnvironment()],
             reload_dataloaders_every_n_epochs=1,
             accelerator=hardware.accelerator,
             devices=hardware.devices,
