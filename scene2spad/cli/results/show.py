@@ -156,17 +156,19 @@ def _facts(command: Show, kind: str) -> tuple[dict[str, str], tuple[tuple[str, l
         ]
         return {"sensor": contents.sensor.name}, (("What the file states", rows),)
     if kind == "set":
-        records = [r for r in _index(path) if isinstance(r, dict)]
-        return {"views": str(len(records))}, (("Views", [_flat(r) for r in records]),)
-    facts: list[JsonObject] = []
+        records = _index(path)
+        failed = sum("failed" in record for record in records)
+        facts = {"views": str(len(records) - failed)} | ({"failed": str(failed)} if failed else {})
+        return facts, (("Views", [_flat(record) for record in records]),)
+    model: list[JsonObject] = []
     if kind == "network":
         from csph.weights.cards import checkpoint_of
         from csph.weights.shipped import CARD
 
         source = checkpoint_of(path)
         card = source / CARD if source.is_dir() else source.with_name(CARD)
-        facts = [{"key": k, "value": v} for k, v in _model_facts(source, card).items()]
-    return {}, ((("What made it", facts),) if facts else ())
+        model = [{"key": k, "value": v} for k, v in _model_facts(source, card).items()]
+    return {}, ((("What made it", model),) if model else ())
 
 
 def _model_facts(source: Path, card: Path) -> dict[str, object]:
@@ -184,10 +186,13 @@ def _flat(record: Mapping[str, object]) -> dict[str, object]:
     return {key: json.dumps(value) if isinstance(value, (dict, list)) else value for key, value in record.items()}
 
 
-def _index(folder: Path) -> list[object]:
+def _index(folder: Path) -> list[JsonObject]:
+    """Return the records of a set in the order of its views, those of one that is being rendered too. A view that was
+    tried again, or whose line is in both files since a process was killed between them, has one."""
     lines = [line for name in ("index.jsonl", "journal.jsonl") for line in read_whole_lines(folder / name)]
-    require(bool(lines), f"{folder}: a set without a view")
-    return lines
+    known = {line["view"]: line for line in lines if isinstance(line, dict) and isinstance(line.get("view"), int)}
+    require(bool(known), f"{folder}: a set without a view")
+    return [known[view] for view in sorted(known)]
 
 
 def _as_png(command: Show, kind: str) -> bytes:
@@ -215,7 +220,7 @@ def _picture(command: Show, kind: str, out: Path) -> Path:
         from render.transient import read_transient
         from scene2spad.datasets.contact_sheets import draw_views
 
-        files = [path / r["file"] for r in _index(path) if isinstance(r, dict) and r.get("file")][:MAX_SHEET]
+        files = [path / record["file"] for record in _index(path) if record.get("file")][:MAX_SHEET]
         require(bool(files), f"{path}: a set without a view that was rendered")
         return draw_views([read_transient(file) for file in files], out, columns=min(8, len(files)))
     if kind == "pulse":
