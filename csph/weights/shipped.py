@@ -43,6 +43,12 @@ def checkpoint_name(path: Path) -> str:
     return path.parent.name if inside else path.name if path.is_dir() else path.stem
 
 
+def is_unfinished(checkpoint: Path) -> bool:
+    """Return whether a checkpoint lies in a run's folder whose training was stopped, and can go on there."""
+    folder = checkpoint_file(checkpoint).parent
+    return (folder / RESUME).is_file() and not (folder / f"{RUN_WEIGHTS[1]}.safetensors").is_file()
+
+
 def is_shipped(checkpoint: Path) -> bool:
     """Return whether a checkpoint lies as shipped ones do, its card beside it."""
     return checkpoint.with_name(CARD).is_file()

@@ -1,12 +1,15 @@
-"""Warn of decoders that fail near the ends of a network's range."""
+"""Warn of decoders that fail near the ends of a network's range, and of networks whose training has not ended."""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 from csph.networks.config import ModelConfig
 from csph.networks.periodic import ENDS_BINS
 from csph.networks.posterior import Decoder
+from csph.weights.cards import checkpoint_of
+from csph.weights.shipped import is_unfinished
 
 log = logging.getLogger("scene2spad")
 
@@ -20,3 +23,9 @@ def warn_of_ends(name: str, model: ModelConfig, decoder: Decoder | None) -> None
             "of both ends of the range; --decoder median is not"
         )
         log.warning(message, name, ENDS_BINS, ENDS_BINS * model.sensor.bin_depth_m)
+
+
+def warn_of_unfinished(name: str | Path) -> None:
+    """Log that the training of a model was stopped: its weights are those of an epoch before the last."""
+    if is_unfinished(checkpoint_of(name)):
+        log.warning("%s: its training has not come to its end; the same `train` command goes on with it", name)

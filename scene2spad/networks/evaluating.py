@@ -23,7 +23,7 @@ from csph.weights.shipped import checkpoint_name
 from scene2spad.datasets.renders import unsure_scenes, views_at
 from scene2spad.methods import classical_method
 from scene2spad.networks.depth_maps import check_free, map_writer
-from scene2spad.networks.end_warnings import warn_of_ends
+from scene2spad.networks.end_warnings import warn_of_ends, warn_of_unfinished
 from scene2spad.networks.training import common_tile
 from scene2spad.networks.unfinished import Unfinished
 from scene2spad.options.networks import Evaluate
@@ -81,6 +81,7 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
     methods: dict[str, Method] = {}
     groups: dict[str, list[str]] = {}
     for path, model, group in zip(command.checkpoints, models, designs, strict=True):
+        warn_of_unfinished(path)
         warn_of_ends(str(path), model.config, command.decoder)
         for suffix, int8 in (("", False), (in_8_bits, True))[: 1 + command.int8]:
             read = {"int8": int8, "int8_rule": rule, "decoder": command.decoder}

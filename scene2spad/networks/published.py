@@ -28,6 +28,7 @@ from csph.networks.grid import published_centroid_bins
 from csph.networks.model import DepthModel
 from csph.networks.posterior import DECODERS, Decoder
 from csph.weights.cards import checkpoint_of
+from scene2spad.networks.end_warnings import warn_of_unfinished
 from scene2spad.networks.registry import EvaluatedModel, ModelSpec
 from scene2spad.networks.results import Store
 from scene2spad.networks.unfinished import Unfinished
@@ -287,7 +288,8 @@ def run_evaluate(command: Evaluate, progress: Progress) -> dict:
         require(value in (None, False), f"evaluate: {option} does not go with --set published")
     kept = not command.baselines or command.baselines == Evaluate.baselines
     require(kept, "evaluate: --baselines does not go with --set published, which is of networks alone")
-    for model in named.values():
+    for name, model in named.items():
+        warn_of_unfinished(name)
         model.config.sensor.check_offset(command.offset)
     unfinished = Unfinished(command.out / "unfinished")
     rows = evaluate_as_published(named, unfinished, seed=command.seed, offset_m=command.offset, progress=progress)

@@ -19,7 +19,7 @@ from csph.evaluation.methods import DepthEstimator
 from csph.networks.checkpoint import load_model, weights_sha256
 from csph.networks.config import ModelConfig, TrainConfig
 from csph.networks.model import DepthModel
-from csph.weights.shipped import RESUME, WEIGHTS, file_names, is_shipped, ship, shipped_file
+from csph.weights.shipped import WEIGHTS, file_names, is_shipped, is_unfinished, ship, shipped_file
 from scene2spad.networks.training import config_of, run_train
 from scene2spad.options.networks import PLANES, Train, TrainingPreset
 from scenes.errors import require
@@ -291,11 +291,10 @@ def _loaded(wanted: ModelSpec, path: Path) -> Trained:
 
 def _finished(found: Trained) -> bool:
     """Return whether a run came to its end; one that was killed between its log and its last weights did not."""
-    folder = found.path.parent
-    if (folder / "last.safetensors").is_file():
-        return True
-    if (folder / RESUME).is_file():
+    if is_unfinished(found.path):
         return False
+    if found.path.with_name("last.safetensors").is_file():
+        return True
     rows = found.table("log.csv")
     return bool(rows) and rows[-1]["step"] >= found.config.steps
 

@@ -32,6 +32,7 @@ from csph.weights.cards import checkpoint_of
 from scene2spad.datasets.planes import random_planes
 from scene2spad.datasets.workers import check_workers
 from scene2spad.methods import code_of
+from scene2spad.networks.end_warnings import warn_of_unfinished
 from scene2spad.networks.level_warnings import level_warnings
 from scene2spad.options.networks import PLANES, Train, check_used
 from scenes.errors import InputError, require
@@ -298,6 +299,7 @@ def begun_with(command: Train, config: TrainConfig) -> WeightsOf | NetworkOf | N
     if begun is None:
         return None
     init = begin_with(checkpoint_of(begun), network_alone=command.init_network is not None)
+    warn_of_unfinished(begun)
     check_init(init, config)
     return init
 
