@@ -30,7 +30,7 @@ def claim_run(folder: Path, config: TrainConfig) -> None:
     """
     path = folder / "config.json"
     if path.is_file():
-        _check_same(folder, config)
+        check_same(folder, config)
     else:
         require_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -45,8 +45,9 @@ def require_free(folder: Path) -> None:
     require(there, f"{folder}: is not an empty folder and holds no run; choose another --out")
 
 
-def _check_same(folder: Path, config: TrainConfig) -> None:
-    """Raise InputError where a run's folder was made by another configuration."""
+def check_same(folder: Path, config: TrainConfig, *, sets: bool = True) -> None:
+    """Raise InputError where a run's folder was made by another configuration; `sets`: or with other sets and weights
+    to begin with, whose hashes the configuration then has."""
     known = read_json_object(folder / "config.json", "configuration")
     refusal = f"{folder}: holds a run with other options or another set"
     try:  # compared as configurations: options that a file of an older version lacks have their defaults
@@ -56,7 +57,7 @@ def _check_same(folder: Path, config: TrainConfig) -> None:
     stood, asked = (json.loads(json.dumps(one)) for one in (there, config.to_dict()))
     # hashes tell what a run began with, and own codes; older versions wrote no ancestors, and files may move
     for one in (stood, asked):
-        for name in ("ancestors", FILE):
+        for name in ("ancestors", FILE) if sets else [*one["data"]]:
             one["data"].pop(name, None)
     differing = _differences(stood, asked)
     require(not differing, f"{refusal} ({'; '.join(differing[:3])}); choose another --out")

@@ -13,6 +13,7 @@ from csph.codes.tensor import CodingTensor
 from csph.networks.config import COUNT_BYTES, TrainConfig
 from csph.networks.model import DepthModel
 from csph.training.own_codes import own_codes_of
+from csph.training.resume import check_same, require_free
 from csph.weights.shipped import TIMINGS
 from scene2spad.datasets.workers import check_workers
 from scene2spad.dry_runs.resources import Cost, memory, timed
@@ -20,7 +21,7 @@ from scene2spad.networks.level_warnings import level_warnings
 from scene2spad.networks.training import begun_with, check_sets, config_of, folder_of
 from scene2spad.options.networks import Train
 from scenes.errors import require
-from scenes.io.inputs import read_json_object, read_whole_lines
+from scenes.io.inputs import read_whole_lines
 
 log = logging.getLogger("scene2spad")
 
@@ -45,6 +46,9 @@ def dry_run(command: Train) -> dict:
     for warning in level_warnings(config):
         log.warning("%s", warning)
     folder = folder_of(command)
+    require_free(folder)
+    if (folder / "config.json").is_file():
+        check_same(folder, config, sets=False)
     done, own = recorded_epochs(folder), own_codes_of(config, folder)
     if done is None:
         seconds, parameters = step_seconds(config, own)
@@ -90,14 +94,7 @@ def plan_of(config: TrainConfig) -> dict:
 
 
 def recorded_epochs(folder: Path) -> Recorded | None:
-    """Return what a run's folder has recorded of its epochs; None where there is nothing. InputError for another
-    folder."""
-    if not folder.exists():
-        return None
-    require(folder.is_dir(), f"{folder}: is a file, expected a folder")
-    if not (folder / "config.json").is_file():
-        return None
-    read_json_object(folder / "config.json", "configuration")
+    """Return what a run's folder has recorded of its epochs; None where there is nothing."""
     found = {}
     for line in read_whole_lines(folder / TIMINGS):
         match line:

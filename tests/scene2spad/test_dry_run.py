@@ -1,6 +1,7 @@
 """`--dry-run` tells plan, memory and work, and writes nothing; `study all` goes on past what cannot be run."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +19,9 @@ from scene2spad.dry_runs.rendering import (
     trial_sizes,
 )
 from scene2spad.networks.registry import ModelRegistry, ModelSpec
+from scene2spad.networks.training import config_of
 from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study
+from scene2spad.options.networks import Train
 from scene2spad.studies import every
 from scenes.errors import InputError
 from scenes.files import append_line
@@ -135,11 +138,28 @@ def test_a_dry_training_tells_its_steps(capfd, folder):
     assert said["parameters"] > 1000 and said["estimate"]["seconds"] > 0 and "random counts" in said["basis"]
     run = folder / "run"
     run.mkdir()
-    (run / "config.json").write_text("{}")
+    config = config_of(Train(preset="smoke"))
+    (run / "config.json").write_text(json.dumps(replace(config, data={"training_sha256": "any"}).to_dict()))
     (run / "timings.jsonl").write_text('{"epoch": 1, "wall_s": 4.0, "cpu_s": 3.0}\n')
     said = answer(capfd, "train", "--preset", "smoke", "--dry-run", "--out", "run")
     assert said["steps_left"] == 4 and said["estimate"]["seconds"] == pytest.approx(4.0)
     assert main(["train", "--set", "nowhere", "--dry-run"]) == 2
+
+
+def test_a_dry_training_refuses_the_folders_that_the_training_does(capfd, folder):
+    """It told of the epochs that another run had recorded there."""
+    (folder / "run").mkdir()
+    (folder / "run/config.json").write_text(json.dumps(config_of(Train(preset="smoke", seed=1)).to_dict()))
+    (folder / "mine").mkdir()
+    (folder / "mine/notes.txt").write_text("mine")
+    refused = {
+        "run": "holds a run with other options or another set",
+        "mine": "is not an empty folder and holds no run",
+    }
+    for out, line in refused.items():
+        for dry in ([], ["--dry-run"]):
+            assert main(["train", "--preset", "smoke", "--out", out, *dry]) == 2
+            assert f"{out}: {line}" in capfd.readouterr().err
 
 
 def test_a_dry_study_tells_models_and_recorded_runs(capfd, folder):
