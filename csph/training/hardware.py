@@ -104,10 +104,13 @@ def trainer_on(hardware: Hardware, config: TrainConfig, callbacks: Sequence[pl.C
 def fit(runner: pl.Trainer, module: pl.LightningModule, data: pl.LightningDataModule, resume: Path) -> None:
     """Run Lightning's loop to its end, from the state in `resume` on where there is one. InputError for a run that
     took another number of steps than its configuration says."""
+    on_interrupt = signal.getsignal(signal.SIGINT)
     with _quiet():
         try:
             runner.fit(module, data, ckpt_path=resume if resume.is_file() else None, weights_only=True)
-        except SystemExit:  # what Lightning makes of Ctrl-C
+        except SystemExit:  # what Lightning makes of Ctrl-C, which it leaves ignored where that came before its loop
+            if on_interrupt is not None and threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, on_interrupt)
             raise KeyboardInterrupt from None
     taken, asked = runner.global_step, module.config.steps
     require(taken == asked, f"{resume.parent}: the run took {taken} steps of {asked}; delete it to begin the run again")

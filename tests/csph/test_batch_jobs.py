@@ -11,7 +11,7 @@ from test_training import FEW, MODEL, near_planes
 
 from csph.networks.checkpoint import load_model, weights_sha256
 from csph.networks.config import preset
-from csph.training.loop import train
+from csph.training.loop import DepthTraining, train
 from csph.training.views import split_views
 
 IGNORING = """
@@ -65,6 +65,22 @@ def test_a_training_goes_on_where_sigterm_is_ignored_or_has_a_handler_that_retur
 
     found = train(preset("smoke", MODEL, **FEW), *split_views(near_planes(3)), tmp_path, progress=progress)
     assert (found["steps"], len(heard)) == (9, not ignored)
+
+
+def test_ctrl_c_before_the_first_step_leaves_the_next_ctrl_c_alone(tmp_path, monkeypatch):
+    """Lightning ignores it while it shuts down, and for good where it had not begun its loop."""
+
+    def interrupted(self: DepthTraining) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(DepthTraining, "configure_optimizers", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train(preset("smoke", MODEL, **FEW), *split_views(near_planes(3)), tmp_path)
+        assert signal.getsignal(signal.SIGINT) == before
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_sigterm_ends_a_training_by_itself_where_ctrl_c_is_ignored(tmp_path):
