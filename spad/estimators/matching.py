@@ -12,6 +12,7 @@ from spad.sensor.template import FINE_STEP, FINEST_STEP, Taps, pulse_taps
 
 MAX_DIRECT_TAPS = 128
 TOEPLITZ_ROWS = 64
+END_STEPS = 32  # places looked at over four standard deviations of the pulse at an end of the bins
 
 
 def is_circular(sensor: Sensor) -> bool:
@@ -150,11 +151,52 @@ def likelihood(counts: Tensor, sensor: Sensor) -> Tensor:
     return scores
 
 
+def _peak_at_an_end(counts: Tensor, peak: Tensor, sensor: Sensor, taps: Taps) -> Tensor:
+    """Return the likeliest bins (P,), given those that are so by one S and B a pixel: others where a part of the pulse
+    lies outside the bins.
+
+    There S depends on how much of it does. Of a wide pulse the place that S and B were estimated at would keep the
+    answer beside it, so that bins near that end have an S and B each: some of them, then all between two of those.
+    """
+    best, bins = peak.clone(), sensor.bins
+    if is_circular(sensor):
+        return best
+    before, after = -int(taps.shifts[taps.window][0]), int(taps.shifts[taps.window][-1])
+    first, last = (0, min(2 * before, bins) - 1), (max(bins - 2 * after, 0), bins - 1)
+    for near_end, (low, high) in ((peak < before, first), (peak >= bins - after, last)):
+        rows = torch.nonzero(near_end).squeeze(1)
+        if not len(rows):
+            continue
+        some, stride = counts[rows], max(1, (high - low) // END_STEPS)
+        places = [best[rows], *(torch.full_like(rows, place) for place in range(low, high + 1, stride))]
+        found = _likeliest(some, places, sensor, taps)
+        places = [(found + shift).clamp(low, high) for shift in range(1 - stride, stride)]
+        best[rows] = _likeliest(some, places, sensor, taps)
+    return best
+
+
+def _likeliest(counts: Tensor, places: list[Tensor], sensor: Sensor, taps: Taps) -> Tensor:
+    """Return that of some bins (P,) whose centre is the likeliest arrival."""
+    scores = torch.stack([_profile(counts, place, sensor, taps) for place in places], -1)
+    return torch.stack(places, -1).gather(-1, scores.argmax(-1, keepdim=True)).squeeze(-1)
+
+
+def _profile(counts: Tensor, place: Tensor, sensor: Sensor, taps: Taps) -> Tensor:
+    """Return log-likelihood of arrivals in the centres of bins (P,), S and B estimated there, up to a constant of the
+    pixel."""
+    near, exists = _around(counts, place, taps.shifts, sensor)
+    total = counts.sum(-1).double()
+    signal, background = _signal_and_background(near, exists, total, sensor, taps)
+    expected = signal * (exists @ taps.centred) + sensor.bins * background
+    ratio = (signal / background).unsqueeze(-1) * taps.centred
+    return (near * torch.log1p(ratio)).sum(-1) + total * torch.log(background) - expected
+
+
 def log_matched_bins(counts: Tensor, sensor: Sensor) -> Tensor:
     """Return Poisson maximum likelihood over all bin centres, then around the best on a grid of eighths of a bin."""
     taps = pulse_taps(sensor, str(counts.device))
     total = counts.sum(-1).double()
-    peak = likelihood(counts, sensor).argmax(-1)
+    peak = _peak_at_an_end(counts, likelihood(counts, sensor).argmax(-1), sensor, taps)
     near, exists = _around(counts, peak, taps.shifts, sensor)
     _, background = _signal_and_background(near, exists, total, sensor, taps)
     # S at its most likely for each tau, the signal counted over the share of the pulse that the bins see: the term
