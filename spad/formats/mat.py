@@ -20,7 +20,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require, require_kind, require_whole
 from scenes.limits import require_memory
 from spad.detection.laws import LOW_FLUX
-from spad.estimators.bistatic import CO_LOCATED, laser_baseline_m
+from spad.estimators.bistatic import CO_LOCATED, laser_baseline_m, time_tells_depth
 from spad.estimators.depth import estimate_depth
 from spad.formats.linospad import COUNTS, capture_histogram, frame_of
 from spad.formats.matfile import Matrix, load_mat, save_mat
@@ -49,7 +49,8 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     The layout holds no exposure, dead time and law, so that pile-up in its counts cannot be undone (`pile_up_warning`).
     Where nobody knows how many detections are signal, `photons`, `mean_signal_photons` and `SBR` are NaN.
     Where nothing is, and where nothing was detected, bins are 1: published loaders subtract 1 from unsigned numbers.
-    Raises InputError as `check_mat` does, and where the file cannot be written.
+    Raises InputError as `check_mat` does, for zones whose converters have delays, clocks of their own or a chirp, and
+    where the file cannot be written.
 
     Examples
     --------
@@ -65,6 +66,8 @@ def write_mat(histogram: Histogram, path: Path) -> Path:
     path, sensor = Path(path), histogram.sensor
     height, width = histogram.depth_m.shape
     check_mat(path, sensor, height, width, laser_baseline_m(histogram))
+    own = "converters measure other times than twice the depth over the speed of light (delay, clock, chirp)"
+    require(time_tells_depth(histogram), f"{path}: the layout knows no zones whose {own}")
     pulse, taps = _pulse_file(path, height, width), _centred_taps(sensor)
     save_mat(_frame(histogram), path)
     psf = {"PSF_img": np.broadcast_to(taps, (height, width, len(taps))), "psf": taps, "pulse_len": float(len(taps))}

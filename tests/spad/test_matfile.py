@@ -22,7 +22,11 @@ from spad.formats.rgbd import published_taps, transient_from_rgbd
 from spad.measurements.histogram import Histogram
 from spad.sensor.model import PhotonBudget, Sensor
 from spad.sensor.pulse import Pulse, SampledPulse
+from spad.sensor.zone_array import ZoneArray
 from spad.sensor_names import sensor_by_name
+from spad.zones.histogram import sense_zones, with_budget
+
+BRIGHT = PhotonBudget(20_000, 100)
 
 
 def saved(path: Path, compressed: bool = False, **variables) -> Path:
@@ -267,6 +271,24 @@ def test_a_laser_beside_the_camera_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"f\.mat: the layout knows no laser beside .* is at 100 0 -20 mm"):
         write_mat(displaced, tmp_path / "f.mat")
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("late", [{"delay_s": (3e-9, 0.0)}, {"clock": (1.0, 1.02)}, {"chirp_hz": 1e5}, {}], ids=str)
+def test_zones_that_measure_other_times_are_refused(late, tmp_path):
+    """The layout's bin is of twice the depth: a delay of 3 ns had put it 30 bins from the return."""
+    plane = np.full((16, 16), 3.0)
+    wall = transient_from_rgbd(plane, plane, plane, meta={"camera": {"fov_deg": 60.0}})
+    sensor = Sensor(name="two", bins=512, bin_width_s=1e-10, pulse=Pulse(2e-10))
+    two = with_budget(ZoneArray((-0.2, 0.2), (0.0,) * 2, (0.3,) * 2, (0.5,) * 2, **late), wall, sensor, BRIGHT)
+    histogram = sense_zones(wall, sensor, two, seed=1)
+    if late:
+        with pytest.raises(InputError, match=r"f\.mat: the layout knows no zones whose converters measure other times"):
+            write_mat(histogram, tmp_path / "f.mat")
+        assert not [*tmp_path.iterdir()]
+        return
+    write_mat(histogram, tmp_path / "f.mat")
+    frame = load_mat(tmp_path / "f.mat")
+    assert np.abs(frame["bin"].astype(int) - frame["est_range_bins_lmf"]).max() <= 1
 
 
 def test_the_same_data_give_the_same_bytes_whenever_they_are_written(tmp_path, monkeypatch):
