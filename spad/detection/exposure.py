@@ -35,6 +35,7 @@ Finished = TypeVar("Finished")
 STREAM_PIXELS = 1024
 # From this many primary detections a bin on, drawing every bin is cheaper than drawing every photon (measured).
 DENSE_FROM = 4.0
+STEPS_PER_BIN = 40  # before jitter, whose drawing costs as much as that of a bin (measured)
 # Photons, or bins, that a thread holds at once: a block with more is drawn in parts. None of up to 4096 bins has more.
 MAX_HELD = 1 << 24
 MAX_CROSSTALK_EVENTS = 1 << 26
@@ -229,7 +230,8 @@ def _block(
 
 def _is_dense(exposure: Exposure, light: BlockLight) -> bool:
     by_bins = exposure.law.by_bins and not (exposure.delays_detected and steps_per_bin(exposure.sensor) == 0)
-    return by_bins and light.primaries > DENSE_FROM * exposure.sensor.bins * light.flux.pixels
+    bins = max(exposure.sensor.bins, _held_per_pixel(exposure) / STEPS_PER_BIN)
+    return by_bins and light.primaries > DENSE_FROM * bins * light.flux.pixels
 
 
 def _held_per_pixel(exposure: Exposure) -> int:

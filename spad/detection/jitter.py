@@ -15,10 +15,9 @@ import numpy as np
 
 from spad.detection.laws import Detections
 from spad.sensor.model import Sensor
-from spad.sensor.pulse import REACH_SIGMAS, AnyPulse, convolved
+from spad.sensor.pulse import REACH_SIGMAS, AnyPulse, Pulse, convolved
 
-STEPS_PER_STD = 4  # of the pulse
-MAX_STEPS = 16  # per bin
+STEPS_PER_SIGMA = 4  # of the pulse
 MAX_BINS, FINEST_S = 65536, 1e-15  # of a sensor
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 
@@ -30,11 +29,13 @@ def before_detection(sensor: Sensor) -> Sensor:
 
 
 def steps_per_bin(sensor: Sensor) -> int:
-    """Return into how many steps a bin is divided before jitter, 1 to MAX_STEPS: finer than the pulse, as the first
-    photons of a cycle are not uniform within a bin. 0 where not even the bins of a period fit a sensor."""
-    wanted = math.ceil(min(STEPS_PER_STD * sensor.bin_width_s / sensor.pulse.std_s, MAX_STEPS))
-    fit = MAX_BINS // sensor.bins_per_period
-    return min(max(1, min(wanted, int(sensor.bin_width_s / FINEST_S))), fit)
+    """Return into how many steps a bin is divided before jitter: finer than the pulse rises, as the first photons of a
+    cycle are not uniform within a bin. As many as a sensor's bins hold; 0 where not even the bins of a period do."""
+    pulse = sensor.pulse
+    rise_s = pulse.sigma_s if isinstance(pulse, Pulse) else pulse.std_s
+    finest = max(1, int(sensor.bin_width_s / FINEST_S))
+    wanted = math.ceil(min(STEPS_PER_SIGMA * sensor.bin_width_s / rise_s, finest))
+    return min(wanted, MAX_BINS // sensor.bins_per_period)
 
 
 def over_the_period(sensor: Sensor) -> Sensor:

@@ -55,6 +55,27 @@ def test_the_first_photon_is_detected_and_then_late(law, dense_from, jitter_s, w
     assert abs(number - cycles) < 4.5 * np.sqrt(cycles * np.exp(-5)) + 1
 
 
+@pytest.mark.parametrize("beyond_s", [-20e-12, 0.0, 30e-12])
+@pytest.mark.parametrize("dense_from", [0.0, np.inf])
+@pytest.mark.parametrize("pulse", [Pulse(10e-12), Pulse(10e-12, 150e-12)], ids=["Gaussian", "tail"])
+def test_a_return_beside_the_edge_of_a_bin_far_wider_than_its_rise(pulse, dense_from, beyond_s, monkeypatch) -> None:
+    """First photons of a return about the edge of two bins of 1.25 ns: their shares, after a jitter of 30 ps."""
+    monkeypatch.setattr("spad.detection.exposure.DENSE_FROM", dense_from)
+    width_s, cycles, mean, jitter_s = 1.25e-9, 2000, 1.0, 30e-12
+    sensor = Sensor(bins=24, bin_width_s=width_s, pulse=pulse, jitter=Pulse(jitter_s), exposure_s=cycles * 24 * width_s)
+    path = (12 * width_s + beyond_s) * SPEED_OF_LIGHT_M_PER_S
+    counts = sense(same(100, (path, path, 1.0)), sensor, PhotonBudget(mean * cycles, 0), seed=4, model="first-photon")
+    time_s = np.linspace(-1e-10, 4e-9, 400_001) - pulse.tail_s + beyond_s
+    arrived = np.concatenate(([0.0], np.cumsum(pulse.bin_masses(time_s - beyond_s))))
+    first = -np.diff(np.exp(-mean * arrived))  # share of the cycles whose first photon comes in each step
+    before = first @ stats.norm.cdf(-(time_s[1:] + time_s[:-1]) / 2 / jitter_s)
+    number = 100 * cycles
+    found = counts.counts[..., :12].sum()
+    assert abs(found - number * before) < 4.5 * np.sqrt(number * before) + 1e-3 * number
+    every = number * -np.expm1(-mean)
+    assert abs(counts.counts.sum() - every) < 4.5 * np.sqrt(every)
+
+
 def test_a_period_of_more_bins_than_a_sensor_has_is_drawn_photon_by_photon() -> None:
     """A gate of 100 ns in a period of 100 us, with as much background as drawing every bin at once pays off for."""
     sensor = Sensor(bins=100, bin_width_s=1e-9, period_s=1e-4, pulse=Pulse(1e-9), exposure_s=500 * 1e-4)
