@@ -22,7 +22,7 @@ from spad.sensor.pulse import REACH_SIGMAS, AnyPulse, Pulse, SampledPulse, pulse
 
 FINE_STEP = 1 / 8  # bins between the arrivals of an estimator's fine grid; a parabola does the rest
 FINEST_STEP = FINE_STEP / 8  # the same around the best of these, where the pulse is too narrow for a parabola there
-NARROW = 0.4  # share of a pulse in one bin above which it is
+NARROW = 0.6  # change of a bin's share a bin of arrival, over the largest share, above which it is: a rise counts, too
 
 
 def _normal_cdf(x: Tensor) -> Tensor:
@@ -181,7 +181,7 @@ class Taps(NamedTuple):
     fine: Tensor  # (G, L) float64, h of bin `shifts` for an arrival at `steps`
     coarse: slice  # the taps that the search over all bins uses
     window: Tensor  # (L,) bool, the taps that split signal from background
-    finest: Tensor | None  # (G', L) float64, of a narrow pulse: h in steps of FINEST_STEP from -1 - FINE_STEP bins on
+    finest: Tensor | None  # (G', L) float64, of a narrow pulse or rise: h in FINEST_STEPs from -1 - FINE_STEP bins on
 
     @property
     def centred(self) -> Tensor:
@@ -222,5 +222,5 @@ def pulse_taps(sensor: Sensor, device: str) -> Taps:
         fine=fine,
         coarse=slice(below - near_below, below + near_above + 1),
         window=(shifts >= -window[0]) & (shifts <= window[1]),
-        finest=moved(finest) if float(fine[count].max()) > NARROW else None,
+        finest=moved(finest) if float(fine.diff(dim=0).abs().max() / fine.max()) > NARROW * FINE_STEP else None,
     )
