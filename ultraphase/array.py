@@ -31,7 +31,8 @@ class Frame:
 
     out        (cores that put anything out, words) int64, in row-major order of the cores
     out_cores  (row, column) of these cores
-    out_bits   (cores,) bits that left each core of the array
+    out_sizes  bits of each word of `out`
+    out_bits   (rows, columns): bits that left each core of the array
     cycles     (rows, columns): clocks of each core, waiting on links included
     stalls     (rows, columns): clocks of them spent waiting on links
     counters   sums over the cores
@@ -39,6 +40,7 @@ class Frame:
 
     out: np.ndarray
     out_cores: np.ndarray
+    out_sizes: np.ndarray
     out_bits: np.ndarray
     cycles: np.ndarray
     stalls: np.ndarray
@@ -133,7 +135,7 @@ class ArrayRun:
         self.link_time = np.zeros((len(STEPS), lanes), np.int64)  # when it was last filled or emptied
         self.visits = np.zeros(len(self.program.instructions), np.int64)
         self.wraps = self.saturations = self.events = 0
-        self.out: list[tuple[np.ndarray, np.ndarray, int]] = []
+        self.out: list[np.ndarray] = []  # (core, word, bits) of those that left at one instruction
         self.ram_bytes = self.program.ram_bytes
         self.changed = True  # the status of some core
         self.code = [self._kind(one) for one in self.program.instructions]
@@ -291,10 +293,9 @@ class ArrayRun:
         self._saturate(one, lanes, *HALF_LIMITS)
 
     def _leave(self, one: Instruction, lanes: slice | np.ndarray, index: np.ndarray, low: int, high: int) -> None:
-        value = self.registers[one.rs][lanes]
+        value, size = self.registers[one.rs][lanes], high - low + 1
         self.wraps += _outside(value, low, high)
-        bits = (high - low + 1).bit_length() - 1
-        self.out.append((index.copy(), (value - low) % (high - low + 1) + low, bits))
+        self.out.append(np.stack(np.broadcast_arrays(index, (value - low) % size + low, size.bit_length() - 1)))
         self.events += 1
 
     def _outb(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
@@ -369,9 +370,7 @@ class ArrayRun:
     def _result(self) -> Frame:
         array, lanes = self.array, len(self.status)
         shape, clocks = array.shape, array.chip.clocks_per_instruction
-        owner = np.concatenate([index for index, _, _ in self.out] or [np.zeros(0, np.int64)])
-        words = np.concatenate([words for _, words, _ in self.out] or [np.zeros(0, np.int64)])
-        bits = np.concatenate([np.full(index.size, size) for index, _, size in self.out] or [np.zeros(0, np.int64)])
+        owner, words, bits = np.concatenate([np.zeros((3, 0), np.int64), *self.out], axis=1)
         cores, counts = np.unique(owner, return_counts=True)
         other = int(np.argmax(counts != counts[0])) if counts.size else 0
         if other:
@@ -379,12 +378,13 @@ class ArrayRun:
             raise InputError(
                 f"program {self.program.name}: cores put out different numbers of words: {', '.join(parts)}"
             )
-        order = np.argsort(owner, kind="stable")
+        order, size = np.argsort(owner, kind="stable"), (len(cores), counts[0] if counts.size else 0)
         ops = [one.op for one in self.program.instructions]
         instructions = int(self.instructions.sum())
         return Frame(
-            out=words[order].reshape(len(cores), counts[0] if counts.size else 0),
+            out=words[order].reshape(size),
             out_cores=np.stack(np.divmod(cores, shape[1]), axis=-1),
+            out_sizes=bits[order].reshape(size),
             out_bits=np.bincount(owner, bits, lanes).astype(np.int64).reshape(shape),
             cycles=((self.instructions + self.stalled) * clocks).reshape(shape),
             stalls=(self.stalled * clocks).reshape(shape),

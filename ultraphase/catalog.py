@@ -107,6 +107,11 @@ class Method:
         return SPATIAL_BLOCK if self.family in ("separable", "learned") else (1, 1)
 
     @property
+    def saturates(self) -> bool:
+        """Return whether the numbers in RAM stay at their top, as counters do; sums of codes wrap around."""
+        return self.family == "coarse"
+
+    @property
     def temporal_bins(self) -> int:
         """Return Mt of the temporal coding tensor that the program's table comes from; 0 where there is none."""
         wide = dict.fromkeys(("fourier", "addressed"), TIMESTAMPS)

@@ -6,6 +6,7 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from ultraphase.array import CoreArray, Frame
+from ultraphase.assembly.isa import HALF_LIMITS
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.catalog import Method
 from ultraphase.products import Tabulated
@@ -18,8 +19,8 @@ _BRIGHT, _PHOTONS = 4, 300  # cores with so many photons; all others have one
 def words_put_out(
     program: Program, array: CoreArray, found: Tabulated, random: np.random.Generator
 ) -> tuple[str, ...] | None:
-    """Return the number in RAM that each word is which leaves a core at a frame's end, "" for another; None where cores
-    send to their neighbours.
+    """Return the number in RAM that each word is which leaves a core at a frame's end, "" for another and for one that
+    has more or fewer bits than its number; None where cores send to their neighbours.
 
     Four frames run, of the same photons but for the third. Raises InputError where a frame puts out other words after
     others than at first.
@@ -36,7 +37,8 @@ def words_put_out(
         return ()
     words = np.concatenate([frames[0].out, frames[2].out])
     numbers = np.concatenate([held[cores] for _, _, held in (one, other)])
-    return _named(program, words, numbers, found.numbers, int(frames[0].out_bits[0, cores[0]]))
+    sizes = np.concatenate([frames[0].out_sizes, frames[2].out_sizes])
+    return _named(program, words, sizes, numbers, found.numbers)
 
 
 def _photons(cores: int, found: Tabulated, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,33 +65,36 @@ def _require_same(program: Program, first: Frame, later: Frame) -> None:
 
 
 def _named(
-    program: Program, words: np.ndarray, numbers: np.ndarray, names: tuple[str, ...], bits: int
+    program: Program, words: np.ndarray, word_bits: np.ndarray, numbers: np.ndarray, names: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Name the number that each word always is: words and numbers (frames x cores, ...); each number once, as far as
-    two are ever different."""
+    """Name the number that each word always is, in as many bits: words, their bits and numbers (frames x cores, ...);
+    each number once, as far as two are ever different."""
     sizes = np.concatenate([np.full(part.count, 8 * KINDS[part.kind].itemsize) for part in program.state])
     left, found = list(range(len(names))), []
-    for word in words.T:
-        off = (word[:, None] - numbers) % (1 << sizes)
+    for word, bits in zip(words.T, word_bits.T, strict=True):
+        off = ((word[:, None] - numbers) % (1 << sizes)).astype(bool) | (bits[:, None] != sizes)
         same = np.flatnonzero(~off.any(axis=0)).tolist()
         found.append(next((number for number in same if number in left), same[0] if same else -1))
         left = [number for number in left if number != found[-1]]
-    narrow = bits < sum(int(sizes[number]) if number >= 0 else 8 for number in found)  # a word that lost its upper byte
-    return tuple("" if number < 0 or (narrow and sizes[number] > 8) else names[number] for number in found)
+    return tuple("" if number < 0 else names[number] for number in found)
 
 
 def require_block_end(method: Method, temporal: np.ndarray, seed: int = 0) -> None:
     """Raise InputError unless a block of the catalogue's cores puts out the weighted sum of its photons, for random
-    weights, and again after another frame. A method of single cores `verify` has run to the end."""
+    weights, and again after another frame; also a sum that leaves 16 bits, at both ends. A method of single cores
+    `verify` has run to the end."""
     if method.block == (1, 1):
         return
     random, program = np.random.default_rng(seed), method.program()
     cores, matrix = method.block[0] * method.block[1], method.matrix(temporal)
     weights = random.integers(-INT8_SCALE, INT8_SCALE + 1, (*method.block, method.codes))
+    weights[..., 0] = INT8_SCALE  # so that bright cores do not cancel
     array = CoreArray(program, method.block, method.tables(temporal, weights))
     one, other = (random.integers(0, matrix.shape[1], (cores, _PHOTONS)) for _ in range(2))
-    for stamps in (one, one, other, one):
-        frame = array.frame(stamps.reshape(-1), np.arange(cores + 1) * _PHOTONS)
+    bright = HALF_LIMITS[1] // int(np.abs(matrix[0]).max())  # photons that a core's own sum still holds
+    top, bottom = (np.full((cores, bright), end) for end in (matrix[0].argmax(), matrix[0].argmin()))
+    for stamps in (one, one, other, one, top, bottom, one):
+        frame = array.frame(stamps.reshape(-1), np.arange(cores + 1) * stamps.shape[1])
         sums = matrix[:, stamps].sum(axis=-1).T.reshape(cores, -1, method.codes)
         right = spatial_sum(sums, weights.reshape(cores, method.codes)).reshape(1, -1)
         same = np.array_equal(frame.out, right)

@@ -36,6 +36,7 @@ def verify(
     *,
     chip: ChipSpec | None = None,
     timestamps: int | None = None,
+    saturates: bool | None = None,
     seed: int = 0,
 ) -> Tabulated:
     """Run every timestamp from different contents of RAM and registers, and compare what it adds with the matrix.
@@ -43,6 +44,8 @@ def verify(
     program      with `tables` for its RAM
     matrix       (numbers in RAM, timestamps) integers; None skips the comparison
     timestamps   how many there are (the matrix' columns, else the program's or the chip's)
+    saturates    True: all numbers must stay at their top; False: all must wrap around; None for either
+
     States: RAM all zero, all at the top, all at the bottom, random; of 8-bit counters every uniform value. Registers as
     a new frame has them up to its first photon, with zeros and with random numbers before it; as another photon left
     them; and 0 or random where any photon so far changed them. A photon goes on where the core waits for it, so that
@@ -51,8 +54,9 @@ def verify(
 
     Raises InputError if what a photon adds, or how long it takes, depends on the state; if the frame ends at a photon;
     if the program changes a table, lets words out, or writes other than zeros before the first photon; if a frame puts
-    out other words after another frame than at first; and where it differs from the matrix, saying at which timestamp
-    and number, or puts out other than the matrix' numbers in their order. `Program` has an example.
+    out other words after another frame than at first; where a number saturates that should wrap around, or wraps around
+    that should saturate; and where it differs from the matrix, saying at which timestamp and number, or puts out other
+    than the matrix' numbers in their order and size. `Program` has an example.
     """
     require_loadable(program, tables, "verify")
     _require_one_core(tables)
@@ -68,18 +72,20 @@ def verify(
         registers = _REGISTERS[states] if states < len(_REGISTERS) else "again"
         after, taken = bench.photon(before, registers)
         if added is None or clocks is None:
-            added, clocks, saturates = after, taken, (after >= 0).all(axis=0)
+            added, clocks, stays = after, taken, (after >= 0).all(axis=0)
         exact = before + added
         if wraps.any():
             wraps = wraps & (after == (exact - low) % (high - low + 1) + low).all(axis=0)
-        if saturates.any():
-            saturates = saturates & (after == np.minimum(exact, high)).all(axis=0)
-        slow, bad = taken != clocks, ~(wraps | saturates)
+        if stays.any():
+            stays = stays & (after == np.minimum(exact, high)).all(axis=0)
+        slow, bad = taken != clocks, ~(wraps | stays)
         if bad.any() or slow.any():
             raise InputError(bench.not_additive(bad, before, after, added, slow) + _WORDS[registers])
         states += 1
     assert added is not None and clocks is not None, "a program that was run on no state"
-    found = Tabulated(program.name, added, low, high, saturates & ~wraps, clocks, states, numbers=bench.names)
+    found = Tabulated(program.name, added, low, high, stays & ~wraps, clocks, states, numbers=bench.names)
+    if saturates is not None:
+        _require_overflow(found, wraps if not saturates else stays, saturates)
     bench.whole_frames(found)
     if matrix is not None:
         _compare(program, added, np.asarray(matrix))
@@ -94,6 +100,11 @@ def _require_one_core(tables: Mapping[str, np.ndarray] | None) -> None:
     for name, values in (tables or {}).items():
         alone = np.ndim(values) == 1
         require(alone, f"verify: table {name} of shape {np.shape(values)}, expected (count,): one core is verified")
+
+
+def _require_overflow(found: Tabulated, right: np.ndarray, saturates: bool) -> None:
+    kinds = "wraps around, expected to saturate" if saturates else "saturates, expected to wrap around"
+    require(bool(right.all()), f"program {found.program}: {found.numbers[int(right.argmin())]} {kinds}")
 
 
 def _other_words(found: Tabulated) -> str:

@@ -54,7 +54,7 @@ def _clocks() -> np.ndarray:
 
 def _proof(chosen: Method) -> Tabulated:
     temporal = int8_temporal(chosen)
-    return verify(chosen.program(), chosen.matrix(temporal), chosen.tables(temporal))
+    return verify(chosen.program(), chosen.matrix(temporal), chosen.tables(temporal), saturates=chosen.saturates)
 
 
 def _counts(pixels: int, seed: int) -> np.ndarray:

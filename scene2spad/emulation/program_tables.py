@@ -30,7 +30,7 @@ def verified(method: Method) -> dict:
     """Return proof of one program against its integer matrix, as numbers for a table."""
     temporal = int8_temporal(method)
     program = method.program()
-    proof = verify(program, method.matrix(temporal), method.tables(temporal))
+    proof = verify(program, method.matrix(temporal), method.tables(temporal), saturates=method.saturates)
     return {
         "name": method.name,
         "words": len(program.instructions),

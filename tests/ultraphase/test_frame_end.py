@@ -48,7 +48,42 @@ def test_each_word_that_leaves_is_named(end, words):
 def test_a_word_without_its_upper_byte_is_no_number_even_where_that_is_zero():
     few = GATE.replace("ADDM [count], r2", "BBS r1, #9, loop\nBBS r1, #8, loop\nADDM [count], r2")  # under 256
     found = verify(assemble(few + BOTH.replace("OUTH r1\nLDH r1, [sum]", "OUTB r1\nLDH r1, [sum]") + CLEAR))
-    assert found.puts_out == ("", "")  # which of the two words is short is not known
+    assert found.puts_out == ("", "sum[0]")
+
+
+def test_a_word_of_more_bits_than_its_number_is_no_number():
+    """As many bits as the matrix' numbers have are what a frame costs, and what a reader of the stream counts on."""
+    chosen = method("coarse-16")
+    wide = (FOLDER / "coarse.s").read_text().replace("OUTB count", "OUTH count")
+    assert verify(assemble(wide, name="wide")).puts_out == ("",) * 16
+    signed = wide.replace("LDB  count, [codes + bin]\n        OUTH", "LDBS count, [codes + bin]\n        OUTH")
+    for source in (wide, signed):
+        with pytest.raises(InputError, match="its frame puts out no number as word 0, no number as word 1"):
+            verify(assemble(source, name="wide"), chosen.matrix())
+
+
+def test_counters_that_lost_their_limit_are_refused_and_so_are_codes_that_got_one():
+    chosen, text = method("coarse-16"), (FOLDER / "coarse.s").read_text()
+    wraps = assemble(text.replace("SATB count, count", "AND  count, count, #255"), name="wraps")
+    assert not verify(wraps, chosen.matrix()).saturates.any()  # none said which
+    with pytest.raises(InputError, match=r"program wraps: codes\[0\] wraps around, expected to saturate"):
+        verify(wraps, chosen.matrix(), saturates=chosen.saturates)
+    with pytest.raises(InputError, match=r"program coarse-16: codes\[0\] saturates, expected to wrap around"):
+        verify(chosen.program(), chosen.matrix(), saturates=False)
+    assert verify(chosen.program(), chosen.matrix(), saturates=True).saturates.all()
+    gate = assemble(GATE + BOTH + CLEAR)  # timestamp 0 adds nothing to `sum`, the others do
+    assert not verify(gate, saturates=False).saturates.any()
+
+
+@pytest.mark.parametrize("lost", ["MOV  a, a", "MAX  a, a, #-32768", "MIN  a, a, #32767"])
+def test_a_block_whose_sum_lost_a_limit_is_refused(monkeypatch, tmp_path, lost):
+    """Four bright cores add up to more than 16 bits; a sum that wrapped around there was called proved."""
+    for path in FOLDER.iterdir():
+        if path.suffix == ".s":
+            (tmp_path / path.name).write_text(path.read_text().replace("SATH a, a", lost))
+    monkeypatch.setattr("ultraphase.catalog.FOLDER", tmp_path)
+    with pytest.raises(InputError, match="separable-8: a block of cores puts out other than the weighted sum"):
+        require_block_end(method("separable-8"), waves(8, 256))
 
 
 @pytest.mark.parametrize("kept", ["STH [count], r1\n", "STH [sum], r1\n", "STH [count], r1\nSTH [sum], r1\n"])
