@@ -1,19 +1,27 @@
-"""Run frames to their end, one after the other, and compare what leaves the sensor with the sums of their photons."""
+"""Run frames to their end, one after the other, and compare what leaves the sensor with the sums of their photons; and
+one whose photons come far apart."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from scenes.errors import InputError, require
 from ultraphase.array import CoreArray, Frame
+from ultraphase.arrivals import TimedCore
 from ultraphase.assembly.isa import HALF_LIMITS
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.catalog import Method
+from ultraphase.chip import ChipSpec
+from ultraphase.core import Core
 from ultraphase.products import Tabulated
 from ultraphase.tables import INT8_SCALE, spatial_sum
 
 LINKS = ("SEND", "RECV")
 _BRIGHT, _PHOTONS = 4, 300  # cores with so many photons; all others have one
+_APART = 100  # photons that come one by one
+_PAUSE = 2000  # clocks from one to the next, at most: many turns of an idle loop
 
 
 def words_put_out(
@@ -39,6 +47,45 @@ def words_put_out(
     numbers = np.concatenate([held[cores] for _, _, held in (one, other)])
     sizes = np.concatenate([frames[0].out_sizes, frames[2].out_sizes])
     return _named(program, words, sizes, numbers, found.numbers)
+
+
+def require_idle(
+    program: Program,
+    tables: Mapping[str, np.ndarray] | None,
+    chip: ChipSpec,
+    found: Tabulated,
+    random: np.random.Generator,
+) -> None:
+    """Raise InputError unless photons that come far apart, so that the core turns in its idle loop before, between and
+    after them, leave what the same photons leave all at once: in RAM, and as words of a core without links."""
+    core = TimedCore(program, tables, chip=chip, port=_APART)  # none of them is lost
+    stamps = random.integers(0, len(found.table), _APART)
+    gaps = np.where(random.random(_APART) < 0.5, random.integers(1, _PAUSE, _APART), 0)
+    comes = np.cumsum(gaps) + _PAUSE
+    ends = int(comes[-1]) + _PAUSE
+    core.registers[:] = random.integers(-(1 << 31), 1 << 31, len(core.registers)).tolist()
+    where = f"program {program.name}: photons that come one by one"
+    linked = any(one.name in LINKS for one in program.instructions)
+    for drain in (False,) if linked else (False, True):
+        _clear(core)
+        frame = core.timed_frame(comes, stamps, ends, drain=drain)
+        require(frame.read == _APART, f"{where} end the frame after {frame.read} of {_APART}")
+        if not drain:
+            held = np.concatenate([core.contents(part.name) for part in program.state]).astype(np.int64)
+            right = found.limited(found.table[stamps].sum(axis=0))
+            wrong = np.flatnonzero(held != right)
+            numbers = [f"{held[n]} in {found.numbers[n]}, all at once {right[n]}" for n in wrong[:1]]
+            require(not numbers, f"{where} leave {''.join(numbers)}")
+        require(drain or not frame.out, f"{where} put out words before the frame is over")
+    if not linked:
+        _clear(core)
+        again, _ = core.frame(stamps.tolist())
+        require(again == frame.out, f"{where} put out other words than all at once")
+
+
+def _clear(core: Core) -> None:
+    for part in core.program.state:
+        core.ram[part.address : part.end] = bytes(part.end - part.address)
 
 
 def _photons(cores: int, found: Tabulated, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from ultraphase.array import CoreArray, Frame
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.chip import ChipSpec, chosen_chip
 from ultraphase.core import require_loadable
-from ultraphase.frame_end import words_put_out
+from ultraphase.frame_end import require_idle, words_put_out
 from ultraphase.products import Tabulated
 
 # What a photon finds in the registers, in the order of the states (see `verify`); from then on what the one before left
@@ -49,10 +49,11 @@ def verify(
     States: RAM all zero, all at the top, all at the bottom, random; of 8-bit counters every uniform value. Registers as
     a new frame has them up to its first photon, with zeros and with random numbers before it; as another photon left
     them; and 0 or random where any photon so far changed them. A photon goes on where the core waits for it, so that
-    what comes before the loop runs once a frame, and its clocks are none of the photon's. Last, whole frames, and
-    frames to their end (`Tabulated.puts_out`).
+    what comes before the loop runs once a frame, and its clocks are none of the photon's. Last, whole frames,
+    frames to their end (`Tabulated.puts_out`), and one of photons far apart.
 
-    Raises InputError if what a photon adds, or how long it takes, depends on the state; if the frame ends at a photon;
+    Raises InputError if what a photon adds, or how long it takes, depends on the state, or on the wait before it; if
+    the frame ends at a photon or while one is waited for;
     if the program changes a table, lets words out, or writes other than zeros before the first photon; if a frame puts
     out other words after another frame than at first; where a number saturates that should wrap around, or wraps around
     that should saturate; and where it differs from the matrix, saying at which timestamp and number, or puts out other
@@ -93,6 +94,7 @@ def verify(
     found = replace(found, puts_out=words_put_out(program, array, found, bench.random))
     if matrix is not None and found.puts_out not in (None, found.numbers):
         raise InputError(_other_words(found))
+    require_idle(program, tables, chip, found, bench.random)
     return found
 
 

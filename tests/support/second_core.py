@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-Core = dict  # r, ram, port, at, out, place
+Core = dict  # r, ram, port, at, out, place, clock; free: when each side's word was taken last
 _LOADS, _STORES = ("LDB", "LDBS", "LDH"), ("STB", "STH", "ADDM", "SUBM")
 _STEPS = {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}
 _OTHER = {"north": "south", "south": "north", "east": "west", "west": "east"}
@@ -50,9 +50,10 @@ class SecondCores:
         ]
 
     def frame(self, stamps: Sequence[Sequence[int]], most: int = 1 << 20) -> list[list[tuple[int, int]]]:
-        """Return (value, bits) of all words that leave each core. Raises Stuck."""
+        """Return (value, bits) of all words that leave each core. A stamp of -1 is a look at the port in vain before
+        the next one, or before the frame's end. Raises Stuck."""
         for core, own in zip(self.cores, stamps, strict=True):
-            core.update(port=deque(own), at=0, out=[], done=False, inbox={})
+            core.update(port=deque(own), at=0, out=[], done=False, inbox={}, free={}, clock=0)
         steps = 0
         while not all(core["done"] for core in self.cores):
             moved = False
@@ -72,26 +73,29 @@ class SecondCores:
         return self.cores[row * self.shape[1] + column]
 
     def _step(self, core: Core) -> bool:
-        """Do one instruction; False where a link holds it."""
+        """Do one instruction, 3 clocks, and wait for the other core before them; False where a link holds it."""
         if core["at"] >= len(self.code):
             raise Stuck("behind the program")
         name, given = self.code[core["at"]]
         if name == "SEND":
-            inbox = self._neighbour(core, given[0])["inbox"]
-            if _OTHER[given[0]] in inbox:
+            other, side = self._neighbour(core, given[0]), _OTHER[given[0]]
+            if side in other["inbox"]:
                 return False
-            inbox[_OTHER[given[0]]] = core["r"][int(given[1][1:])]
+            core["clock"] = max(core["clock"], other["free"].get(side, 0))
+            other["inbox"][side] = core["r"][int(given[1][1:])], core["clock"] + 3
         elif name == "RECV":
             self._neighbour(core, given[1])
             if given[1] not in core["inbox"]:
                 return False
-            core["r"][int(given[0][1:])] = core["inbox"].pop(given[1])
+            core["r"][int(given[0][1:])], there = core["inbox"].pop(given[1])
+            core["clock"] = max(core["clock"], there)
+            core["free"][given[1]] = core["clock"] + 3
         elif name == "HALT":
             core["done"] = True
         else:
             self._alone(core, name, given)
-            return True
         core["at"] += 1
+        core["clock"] += 3
         return True
 
     def _alone(self, core: Core, name: str, given: list[str]) -> None:
@@ -100,10 +104,9 @@ class SecondCores:
         def value(text: str) -> int:
             return int(text[1:]) if text[0] == "#" else r[int(text[1:])]
 
-        core["at"] += 1
         if name[0] == "B" or name == "JMP":
             taken = {
-                "BNT": lambda: not core["port"],
+                "BNT": lambda: not core["port"] or core["port"][0] < 0,
                 "BFE": lambda: not core["port"],
                 "JMP": lambda: True,
                 "BZ": lambda: value(given[0]) == 0,
@@ -112,7 +115,9 @@ class SecondCores:
                 "BBS": lambda: value(given[0]) >> value(given[1]) & 1 == 1,
                 "BBC": lambda: value(given[0]) >> value(given[1]) & 1 == 0,
             }[name]()
-            core["at"] = int(given[-1]) if taken else core["at"]
+            if name == "BNT" and taken and core["port"]:
+                core["port"].popleft()
+            core["at"] = int(given[-1]) - 1 if taken else core["at"]
         elif name in ("OUTB", "OUTH"):
             word = value(given[0])
             core["out"].append((word % 256, 8) if name == "OUTB" else (signed(word, 16), 16))
@@ -124,7 +129,7 @@ class SecondCores:
     @staticmethod
     def _computed(core: Core, name: str, of: list[int]) -> int:
         if name == "RDT":
-            if not core["port"]:
+            if not core["port"] or core["port"][0] < 0:
                 raise Stuck("no timestamp")
             return core["port"].popleft()
         if name == "ID":

@@ -86,6 +86,25 @@ def test_a_block_whose_sum_lost_a_limit_is_refused(monkeypatch, tmp_path, lost):
         require_block_end(method("separable-8"), waves(8, 256))
 
 
+@pytest.mark.parametrize(
+    ("idle", "message"),
+    [
+        ("idle: BFE end\n", "end the frame after 0 of 100"),  # nothing leads back to the loop
+        ("idle: BFE end\nADDM [count], r2\nJMP loop\n", r"leave \d+ in count\[0\], all at once 100"),
+        ("idle: BFE end\nMOV r2, #2\nJMP loop\n", r"leave \d+ in count\[0\], all at once 100"),
+        ("idle: BFE end\nMOV r4, #9\nOUTH r4\nJMP loop\n", "put out words before the frame is over"),
+        ("idle: BFE end\nMOV r7, #1\nJMP loop\n", "put out other words than all at once"),
+    ],
+)
+def test_what_a_core_does_while_it_waits_is_run(idle, message):
+    """No photon was ever waited for: a frame that ends at the first look in vain was called proved."""
+    source = GATE.replace("idle: BFE end\n      JMP loop\n", idle)
+    end = "end: LDH r1, [count]\nADD r1, r1, r7\nOUTH r1\nLDH r1, [sum]\nOUTH r1\nMOV r7, #0\n" + CLEAR
+    with pytest.raises(InputError, match=f"program gate: photons that come one by one {message}"):
+        verify(assemble(source.replace("MOV r2, #1", "MOV r2, #1\nMOV r7, #0") + end, name="gate"))
+    assert verify(assemble(GATE.replace("BFE end", "BFE end\nADD r6, r6, #1") + BOTH + CLEAR)).puts_out  # turns counted
+
+
 @pytest.mark.parametrize("kept", ["STH [count], r1\n", "STH [sum], r1\n", "STH [count], r1\nSTH [sum], r1\n"])
 def test_an_end_that_leaves_sums_behind_is_refused(kept):
     """Every frame after the first began with the sums of those before; the end never ran, and all was verified."""

@@ -168,9 +168,15 @@ def _interpreted(one: ModelSpec, chip: ChipDepth, test: TestSet, seed: int) -> J
 def in_words(row: JsonObject) -> str:
     """Write a row of `compared_rows` as a line; one scene has no interval."""
     message = f"{row['float_mae_mm']:.1f} mm in float, {row['chip_mae_mm']:.1f} on the chip"
-    known = np.isfinite(row["low"])
-    interval = f"{row['low']:+.2%} to {row['high']:+.2%}" if known else "no interval: one scene"
+    interval = interval_in_words(row["low"], row["high"], 2, "scene")
     return f"{row['set']}, {row['model'].rstrip(',')}: {message}, {row['difference']:+.2%} ({interval})"
+
+
+def interval_in_words(low: float, high: float, decimals: int, of: str) -> str:
+    """Write the ends of an interval, fractions, in per cent; one view or scene (`of`) has none."""
+    if not np.isfinite(low):
+        return f"no interval: one {of}"
+    return f"{low:+.{decimals}%} to {high:+.{decimals}%}"
 
 
 def _all_in_words(numbers: JsonObject) -> dict[str, list[str]]:

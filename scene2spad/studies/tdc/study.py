@@ -33,6 +33,7 @@ from scene2spad.plots.figures import plain_log, plt, save
 from scene2spad.plots.style import look
 from scene2spad.studies.chip.chain import ChipDepth
 from scene2spad.studies.chip.code import compile_model
+from scene2spad.studies.chip.study import interval_in_words
 from scene2spad.studies.tdc.plan import (
     CLOCKS,
     DELAY,
@@ -336,7 +337,7 @@ def _symmetric(axes: Axes, beyond: float) -> None:
 def _in_words(numbers: JsonObject) -> JsonObject:
     lines = [
         f"{row['method']}, {row['clock']}: {row['mae_mm']:.1f} mm, {row['within_10mm']:.1%} within 10 mm, "
-        f"{row['difference']:+.1%} ({row['low']:+.1%} to {row['high']:+.1%}), "
+        f"{row['difference']:+.1%} ({interval_in_words(row['low'], row['high'], 1, 'view')}), "
         f"{row['clock_bits']} + {row['code_bits']} bits a pixel"
         for row in numbers["compared"]
     ]
