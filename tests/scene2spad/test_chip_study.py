@@ -10,7 +10,7 @@ from scene2spad.cli import main
 from scene2spad.networks.lookup import found_only
 from scene2spad.options.experiments import Study
 from scene2spad.studies.chip.plan import MAIN, SMOKE, Plan
-from scene2spad.studies.chip.study import compared_rows, in_words
+from scene2spad.studies.chip.study import compared_rows, in_words, interval_in_words
 from scene2spad.studies.power.front import (
     LOST_LIMIT,
     Design,
@@ -123,3 +123,8 @@ def test_study_chip_at_toy_size(capfd, tmp_path):
     counts = {(row["set"], row["levels"]) for row in result["compared"]}
     assert {("tabletop", len(SMOKE.levels)), ("rooms", len(SMOKE.other_levels))} <= counts
     assert {path.rsplit("/", 1)[1] for path in result["csv"]} >= {"chip.csv", "chip-compared.csv"}
+
+
+def test_ends_of_an_interval_are_told_where_there_are_any():
+    assert interval_in_words(-0.012, 0.034, 1, "view") == "-1.2% to +3.4%"
+    assert interval_in_words(np.nan, np.nan, 1, "view") == "no interval: one view"

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from second_core import SecondCores, Stuck
 
 from scenes.errors import InputError
-from tests.support.second_core import SecondCores, Stuck
 from ultraphase import ChipSpec, CoreArray, Method, method, verify
 from ultraphase.assembly.isa import OPS, Instruction, format_instruction
 from ultraphase.assembly.program import Program
@@ -16,6 +16,7 @@ from ultraphase.compiler import compile_code
 from ultraphase.frame_end import require_block_end
 from ultraphase.integer_code import IntegerCode
 
+MOST = 50  # changed programs of each kind, drawn from 500 to 2,000
 NOTHING = Instruction("MOV", 15, value=15)  # r15 is no program's
 
 
@@ -224,7 +225,9 @@ def test_no_changed_program_that_puts_out_other_words_is_called_proved(name, mon
     for module in ("array", "core", "arrivals"):  # programs of so few words are stuck sooner
         monkeypatch.setattr(f"ultraphase.{module}.WATCHDOG_STEPS", 2000)
     kind, refused, alike, passed = KINDS[name](), 0, 0, []
-    for change, program in mutants(kind.program, kind.first):
+    every = [*mutants(kind.program, kind.first)]
+    for number in np.random.default_rng(3).permutation(len(every))[:MOST]:
+        change, program = every[number]
         try:
             kind.proves(program)
         except InputError:
@@ -234,4 +237,4 @@ def test_no_changed_program_that_puts_out_other_words_is_called_proved(name, mon
         alike += not reason
         passed += [f"{change} ({reason})"] if reason else []
     assert not passed, f"{refused} refused, {alike} alike, {len(passed)} passed: {passed}"
-    assert refused > 10 * len(kind.program.instructions[kind.first :])
+    assert refused > MOST / 2
