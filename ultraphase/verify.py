@@ -86,7 +86,7 @@ def verify(
     assert added is not None and clocks is not None, "a program that was run on no state"
     found = Tabulated(program.name, added, low, high, stays & ~wraps, clocks, states, numbers=bench.names)
     if saturates is not None:
-        _require_overflow(found, wraps if not saturates else stays, saturates)
+        _require_overflow(found, np.asarray(stays if saturates else wraps), saturates)
     bench.whole_frames(found)
     if matrix is not None:
         _compare(program, added, np.asarray(matrix))

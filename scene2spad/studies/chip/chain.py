@@ -84,8 +84,8 @@ class FastCores:
                 core = (0, 0) if alike else (row, column)
                 if core not in found:
                     tables = core_tables(compiled, *core)
-                    kinds = {"chip": compiled.chip, "saturates": compiled.code.counters}
-                    found[core] = verify(compiled.program, compiled.matrix[core], tables, **kinds)
+                    stays, matrix = compiled.code.counters, compiled.matrix[core]
+                    found[core] = verify(compiled.program, matrix, tables, chip=compiled.chip, saturates=stays)
                 found[row, column] = found[core]
         return cls(compiled, tuple(tuple(found[r, c] for c in range(columns)) for r in range(rows)))
 
