@@ -65,31 +65,10 @@ def verify(
     count = timestamps or ((program.timestamps or chip.timestamps) if matrix is None else matrix.shape[1])
     require(bool(program.state), f"program {program.name}: declares no .space, there is nothing to verify")
     bench = _Bench(program, CoreArray(program, (1, count), tables, chip=chip), np.random.default_rng(seed))
-    low, high = bench.low, bench.high
-    added = clocks = None
-    wraps = np.ones(len(low), bool)
-    states = 0
-    for before in _states(low, high, bench.random):
-        registers = _REGISTERS[states] if states < len(_REGISTERS) else "again"
-        after, taken = bench.photon(before, registers)
-        if added is None or clocks is None:
-            added, clocks, stays = after, taken, (after >= 0).all(axis=0)
-        exact = before + added
-        if wraps.any():
-            wraps = wraps & (after == (exact - low) % (high - low + 1) + low).all(axis=0)
-        if stays.any():
-            stays = stays & (after == np.minimum(exact, high)).all(axis=0)
-        slow, bad = taken != clocks, ~(wraps | stays)
-        if bad.any() or slow.any():
-            raise InputError(bench.not_additive(bad, before, after, added, slow) + _WORDS[registers])
-        states += 1
-    assert added is not None and clocks is not None, "a program that was run on no state"
-    found = Tabulated(program.name, added, low, high, stays & ~wraps, clocks, states, numbers=bench.names)
-    if saturates is not None:
-        _require_overflow(found, np.asarray(stays if saturates else wraps), saturates)
+    found = bench.additive(saturates)
     bench.whole_frames(found)
     if matrix is not None:
-        _compare(program, added, np.asarray(matrix))
+        _compare(program, found.table, np.asarray(matrix))
     array = CoreArray(program, (1, min(count, _CORES_TO_END)), tables, chip=chip)
     found = replace(found, puts_out=words_put_out(program, array, found, bench.random))
     if matrix is not None and found.puts_out not in (None, found.numbers):
@@ -140,6 +119,32 @@ class _Bench:
         self.names = tuple(f"{region.name}[{n}]" for region in program.state for n in range(region.count))
         self.changed = np.zeros(len(array.registers), bool)
         self.tables = self._table_bytes()
+
+    def additive(self, saturates: bool | None) -> Tabulated:
+        """Return what every timestamp adds, from all states alike. Raises InputError as `verify` does."""
+        low, high, program = self.low, self.high, self.program
+        added = clocks = None
+        wraps = np.ones(len(low), bool)
+        states = 0
+        for before in _states(low, high, self.random):
+            registers = _REGISTERS[states] if states < len(_REGISTERS) else "again"
+            after, taken = self.photon(before, registers)
+            if added is None or clocks is None:
+                added, clocks, stays = after, taken, (after >= 0).all(axis=0)
+            exact = before + added
+            if wraps.any():
+                wraps = wraps & (after == (exact - low) % (high - low + 1) + low).all(axis=0)
+            if stays.any():
+                stays = stays & (after == np.minimum(exact, high)).all(axis=0)
+            slow, bad = taken != clocks, ~(wraps | stays)
+            if bad.any() or slow.any():
+                raise InputError(self.not_additive(bad, before, after, added, slow) + _WORDS[registers])
+            states += 1
+        assert added is not None and clocks is not None, "a program that was run on no state"
+        found = Tabulated(program.name, added, low, high, stays & ~wraps, clocks, states, numbers=self.names)
+        if saturates is not None:
+            _require_overflow(found, np.asarray(stays if saturates else wraps), saturates)
+        return found
 
     def photon(self, before: np.ndarray, registers: str) -> tuple[np.ndarray, np.ndarray]:
         """Run one photon of every timestamp, each on a core with `before` in its RAM: (numbers after it, clocks)."""
