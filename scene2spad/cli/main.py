@@ -24,7 +24,7 @@ import tyro
 
 from scene2spad.cli.completion import SHELLS, completion_script
 from scene2spad.interrupts import stopped
-from scene2spad.options.common import Common
+from scene2spad.options.common import Common, flow_help
 from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
 from scenes.progress import Progress
@@ -199,6 +199,8 @@ def parse_command(argv: list[str]) -> Common:
     try:
         with contextlib.redirect_stderr(usage):
             if argv[0] in COMMANDS:
+                if {"-h", "--help"} & {*argv}:
+                    flow_help(options_of(argv[0]))
                 return tyro.cli(options_of(argv[0]), prog=f"scene2spad {argv[0]}", args=argv[1:])
             every = [Annotated[options_of(name), tyro.conf.subcommand(name)] for name in COMMANDS]
             return tyro.cli(reduce(or_, every), prog="scene2spad", description=DESCRIPTION, args=argv)

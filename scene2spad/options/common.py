@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import tyro
@@ -27,6 +31,8 @@ def required_word(metavar: str) -> object:
     """Return a positional argument of several values that must not stay open, with the name that its help has."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="(required)")
 
+
+WITHOUT_HINT = tyro.conf.arg(help_behavior_hint="")  # of an empty default, where "(default: )" would tell nothing
 
 Metres = tuple[float, float, float] | None
 Pixels = Annotated[int | None, may_stay_open("PIXELS")]
@@ -74,3 +80,16 @@ def only_for(command: Common, where: str, options: Mapping[str, tuple[bool, str]
 def check_indirect(command: Common, where: str, bounces: int | None, options: Sequence[str]) -> None:
     """Raise InputError for options of indirect light, by their fields' names, where only direct light is rendered."""
     only_for(command, where, dict.fromkeys(options, (bounces != 1, "indirect light (--bounces above 1)")))
+
+
+def flow_help(options: type[Common]) -> None:
+    """Give the parser the text of every option as one paragraph, of which it would keep the line breaks otherwise."""
+    texts: dict[str, str] = {}
+    for kind in options.__mro__[-2::-1]:
+        (definition,) = ast.parse(inspect.getsource(kind)).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, text in pairwise(definition.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                texts[ast.unparse(field.target)] = " ".join(str(text.value.value).split())
+    for one in fields(options):
+        one.metadata = MappingProxyType({**one.metadata, "help": texts[one.name]})

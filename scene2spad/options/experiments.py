@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from scene2spad.options.common import Common, Count, File, Long, Number, Positional, may_stay_open, word
+from scene2spad.options.common import WITHOUT_HINT, Common, Count, File, Long, Number, Positional, may_stay_open
 
 MIN_SENSE_REPEATS = 3  # of `bench sense`
 MAX_HEADROOM_BITS = 4  # of the 7 that a code on the chip has
@@ -14,20 +14,23 @@ MAX_HEADROOM_BITS = 4  # of the 7 that a code on the chip has
 
 @dataclass(frozen=True, kw_only=True)
 class Bench(Common):
-    """Speed against error: `render` beside mitransient, `sense` beside dense Poisson draws, `encode` of compressive
-    layers, `network` of depth networks, `emulate` of the in-pixel processor and its two routes to the same bits; the
-    table of `hard-cases`."""
+    """Measure speed against error: `render` beside mitransient, `sense` beside dense Poisson draws, `encode` of
+    compressive layers, `network` of depth networks, `emulate` of the in-pixel processor and its two routes to the
+    same bits; the table of `hard-cases`."""
 
     stage: Positional[Literal["render", "sense", "encode", "network", "emulate", "hard-cases"]] = "render"
     """Stage to measure."""
-    scenes: tuple[
-        Literal["flash", "lamp", "artist", "artist-lamp", "gallery", "groove", "hall", "hall-lamp", "washroom"], ...
+    scenes: Annotated[
+        tuple[
+            Literal["flash", "lamp", "artist", "artist-lamp", "gallery", "groove", "hall", "hall-lamp", "washroom"], ...
+        ],
+        WITHOUT_HINT,
     ] = ()
     """Scenes of `bench render` (default: all)."""
-    sizes: tuple[int, ...] = ()
+    sizes: Annotated[tuple[int, ...], WITHOUT_HINT] = ()
     """Image sides, pixels (default: 64 128 256 of flash, lamp and gallery, 64 128 of artist, artist-lamp and groove,
     64 256 of hall and hall-lamp, 64 of washroom)."""
-    only: tuple[str, ...] = ()
+    only: Annotated[tuple[str, ...], WITHOUT_HINT] = ()
     """Cases of `bench hard-cases`, or programs of `bench emulate` (default: all)."""
     quick: bool = False
     """No 256 pixels, and flash and lamp alone at 128; two levels of one image; no slow hard cases or megapixels."""
@@ -102,21 +105,21 @@ OPTIONS_OF: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Long):
-    """Figures and tables of the paper's supplement: coding tensors (1, 17), their memory (15, 16, Table 1), depth
-    decoded from codes without a network, and the in-pixel processor's power (4, 5); trained codes on that processor,
-    beside the same models in floating point; of trained models: scenes moved out
-    of their training depths (1, 2, 3, 17), and designs by block (6, 7), size (8 to 10) and temporal code (11, 12);
-    captures (13, 14); how much the error of a rendered set itself matters to depth; what a renderer adds to RGB-D
-    simulation, step by step; networks beside the filter where light takes several paths; a real chip's histograms
-    beside what the renderer and the calibrated sensor predict; and codes behind a real clock, corrected or not.
-    `all` runs one after the other, goes on past those whose data are absent, and ends in a table."""
+    """Run one study, or `all`, and write its figures and tables. With figures of the paper's
+    supplement: `tensors` (1, 17), `memory` (15, 16,
+    Table 1), `depth-offset` (1, 2, 3, 17), `power` (4, 5), `spatial-block` (6, 7), `tensor-size` (8
+    to 10), `fourier` (11, 12), `real-data` (13, 14). Studies of ours: depth from `codes` without a network; trained
+    codes on the emulated `chip`; light `transport` added to RGB-D simulation, step by step; networks beside the
+    filter under `multipath`; a real chip beside its model (`sim-to-real`); codes behind a real clock (`tdc`); what
+    the error of a rendered set costs in depth (`render-error`). `all` goes on past studies whose data are absent, and
+    ends in a table."""
 
     name: Positional[StudyName]
     """Study to run, or all of them."""
-    checkpoints: tuple[Path, ...] = ()
+    checkpoints: Annotated[tuple[Path, ...], WITHOUT_HINT] = ()
     """Trained layers that `study tensors` draws: names of models (see `models`), checkpoints, or .npy arrays (K, Mt) or
     (K, Mt, Mr, Mc); trained networks of `study render-error` and `study real-data`, by name or checkpoint."""
-    design: str = ""
+    design: Annotated[str, WITHOUT_HINT] = ""
     """A design that `study tensors` draws instead of the paper's: learned, fourier, gray, coarse, hadamard or random,
     with +learned for a fixed temporal code and a learned spatial part."""
     block: tuple[int, int, int] = (256, 4, 4)
@@ -159,7 +162,7 @@ class Study(Long):
     """First N views of --scene-set to render, at --width x --height."""
     cache: Annotated[Path | None, may_stay_open("FOLDER")] = None
     """Folder that keeps its renders from run to run (default: ~/.cache/scene2spad)."""
-    capture: tuple[Path, ...] = ()
+    capture: Annotated[tuple[Path, ...], WITHOUT_HINT] = ()
     """Captures (.mat) of the LinoSPAD prototype for `study real-data`, instead of rendered ones in their layout."""
     frame: int = 0
     """Frame of these files, from 0."""
@@ -176,8 +179,8 @@ def trains_models(name: str, command: Study) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Common):
-    """One self-contained HTML page of every figure, table, configuration and version made so far: speed against error
-    first, published numbers beside ours, and what was not measured. Nothing is loaded, and it prints well."""
+    """Write one self-contained HTML page of every figure, table, configuration and version made so far: speed against
+    error first, published numbers beside ours, and what was not measured. Nothing is loaded, and it prints well."""
 
     results: Path = Path("out")
     """Folder that `bench`, `study`, `evaluate` and `demo` have filled, with all its subfolders."""
@@ -187,21 +190,21 @@ class Report(Common):
 
 @dataclass(frozen=True, kw_only=True)
 class Ultraphase(Common):
-    """Compressive histograms as programs on the emulated UltraPhase processor: `table` (Supplementary Figure 5 beside
-    the emulation), `compile MODEL` (a trained model's codes), `run PROGRAM`, `asm FILE`, `list FILE`, `verify PROGRAM`,
-    `sweep`. docs/ultraphase-instructions.md has the instructions and directives."""
+    """Run compressive histograms as programs on the emulated UltraPhase processor: `table` (Supplementary Figure 5
+    beside the emulation), `compile MODEL` (a trained model's codes), `run PROGRAM`, `asm FILE`, `list FILE`, `verify
+    PROGRAM` and `sweep`. docs/ultraphase-instructions.md has the instructions and directives."""
 
     action: Positional[Literal["table", "compile", "run", "asm", "list", "verify", "sweep"]] = "table"
     """Action: tabulate or sweep the chip's power, or compile, run, assemble, list or verify a program."""
-    program: Positional[Annotated[str, word("[PROGRAM]")]] = ""
+    program: Positional[Annotated[str, may_stay_open("[PROGRAM]")]] = ""
     """FAMILY-K with family coarse, fourier, separable, learned or addressed, or a source file (.s); of compile, a
     shipped model's name or a checkpoint."""
     headroom: Count = None
     """Make the tables so many bits smaller, so that sums of bright pixels fit 16 bits (compile): 0 to 4 (default: 1; a
     model that was trained for the chip keeps the ranges that it learned)."""
-    define: tuple[str, ...] = ()
+    define: Annotated[tuple[str, ...], WITHOUT_HINT] = ()
     """Constants of a source file, as NAME=VALUE; all behind one --define: --define K=8 SHIFT=7."""
-    table: tuple[str, ...] = ()
+    table: Annotated[tuple[str, ...], WITHOUT_HINT] = ()
     """Contents of the tables of a source file, as NAME=FILE.npy with whole numbers of shape (count,) (run,
     verify), or (rows, columns, count) for each core its own (run)."""
     out: File = None
@@ -218,7 +221,7 @@ class Ultraphase(Common):
     order of time."""
     fps: tuple[float, ...] = (30.0,)
     """Frames a second (sweep)."""
-    codes: tuple[int, ...] = ()
+    codes: Annotated[tuple[int, ...], WITHOUT_HINT] = ()
     """K of the Fourier and separable programs (sweep; default: the seven of the paper); those that are no program are
     listed with the reason."""
     pixels: tuple[int, ...] = (4, 1048576)
@@ -226,5 +229,5 @@ class Ultraphase(Common):
     trace: int = 0
     """Show this many instructions of one core, the first ones of core (0, 0) with clock and line; of a frame that
     fails, the last ones of the core that failed (run)."""
-    watch: str = ""
+    watch: Annotated[str, WITHOUT_HINT] = ""
     """Show the changes of this region of one core's RAM, 100 at the most, as --trace does (run)."""

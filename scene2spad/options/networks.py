@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from scene2spad.options.common import (
+    WITHOUT_HINT,
     Common,
     Count,
     File,
@@ -23,6 +24,7 @@ from scenes.errors import require
 
 PLANES = Path("planes")  # the set that needs no renderer
 TrainingPreset = Literal["smoke", "laptop", "workstation", "gpu", "laptop-v1", "paper"]
+Switch = Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes", "int8"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,14 +46,14 @@ class Train(Long):
     codes_file: File = None
     """Fixed codes of your own instead of --design, as they are: an array (.npy), (K, Mt) or (K, Mt, Mr, Mc), or a table
     as `export` writes it (.txt). Block and number are the file's. The run keeps a copy."""
-    layer: tuple[Literal["per_pixel_norm", "keep_mean", "pulse_in_decoder", "pulse_in_codes", "int8"], ...] = ()
+    layer: Annotated[tuple[Switch, ...], WITHOUT_HINT] = ()
     """Switches of the layer that differ from the published one; int8 trains codes for the in-pixel processor: 8 bits
     within ranges that are learned, sums of 16 bits that wrap (begin with --init)."""
     set: tuple[Path, ...] = (PLANES,)
     """Folders of sets that `dataset` rendered, or their packs (.h5); planes: random planes, no renderer needed."""
-    set_weights: tuple[float, ...] = ()
+    set_weights: Annotated[tuple[float, ...], WITHOUT_HINT] = ()
     """Relative frequency at which patches are drawn from each set (default: alike)."""
-    validation: tuple[Path, ...] = ()
+    validation: Annotated[tuple[Path, ...], WITHOUT_HINT] = ()
     """Sets to validate on (default: the last tenth of the scenes)."""
     preset: TrainingPreset = "laptop"
     """smoke: seconds; laptop: one core, 25 minutes at the most; workstation: two cores, 2 hours at the most; gpu: the
@@ -146,8 +148,8 @@ def check_used(command: Train) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Common):
-    """Trained networks beside classical estimators on a rendered set, at the paper's 16 photon levels; a run that was
-    killed goes on: what networks have estimated lies in OUT/unfinished until it ends."""
+    """Compare trained networks with classical estimators on a rendered set, at the paper's 16 photon levels; a run
+    that was killed goes on: what networks have estimated lies in OUT/unfinished until it ends."""
 
     checkpoints: Positional[Annotated[tuple[Path, ...], required_word("MODEL [MODEL ...]")]]
     """Checkpoints of `train`, their folders, or names of models (see `models`); the first is the one that the others
@@ -163,7 +165,7 @@ class Evaluate(Common):
     baselines: tuple[str, ...] = ("argmax", "log-matched", "fourier-8")
     """Estimators of `depth`, and codes decoded without a network: CODE-K, or your own (K, T) in a file (.npy, or .txt
     as `export` writes it)."""
-    levels: tuple[str, ...] = ()
+    levels: Annotated[tuple[str, ...], WITHOUT_HINT] = ()
     """Photon levels, mean signal + background a pixel, as in 1+100 3+3 (default: the paper's 16); each gets a line."""
     law: Annotated[
         Literal["auto", "poisson", "first-photon", "free-running"] | None,

@@ -298,6 +298,18 @@ def test_help_names_what_a_command_takes(name, capsys):
     assert not {"STR", "[STR]", "PATH", "[PATH]"} & set(usage.split()), usage
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fills_its_lines_and_names_no_empty_default(name, capsys, monkeypatch):
+    """The text of an option stands in one line where the terminal is wide: lines do not break as in the source."""
+    monkeypatch.setenv("COLUMNS", "2000")
+    assert main([name, "--help"]) == 0
+    out = capsys.readouterr().out
+    inside = [line.strip("│ ") for line in out.splitlines() if line.startswith("│")]
+    assert not [line for line in inside if line.startswith(tuple("abcdefghijklmnopqrstuvwxyz`(.,"))]
+    assert name == "report" or out.split("\n\n")[1].count("\n") == 0
+    assert not [line for line in inside if "(default: )" in line or "(default: '')" in line]
+
+
 STOPPING = """
 import os, signal, sys, tempfile, types
 from scene2spad.start import script

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from scene2spad.cli.checks import CHECKPOINT
 from scene2spad.cli.paths import output_folder
-from scene2spad.options.common import Common, Positional, may_stay_open, word
+from scene2spad.options.common import Common, Positional, may_stay_open
 from scenes.errors import InputError, require
 from scenes.io.inputs import regular_file
 from scenes.json_types import JsonObject
@@ -25,9 +25,9 @@ class Models(Common):
     """List the models that come with the package: design, compression, training set, photon levels, error, limits; or
     make a model of a checkpoint of the published code: `import FILE.ckpt --out FOLDER`."""
 
-    name: Positional[Annotated[str, word("[NAME]")]] = ""
+    name: Positional[Annotated[str, may_stay_open("[NAME]")]] = ""
     """Show this one's whole card; or `import`."""
-    file: Positional[Annotated[str, word("[FILE.ckpt]")]] = ""
+    file: Positional[Annotated[str, may_stay_open("[FILE.ckpt]")]] = ""
     """Checkpoint of the published code to import (.ckpt, written by Lightning)."""
     sensor: Annotated[str | None, may_stay_open("NAME")] = None
     """Sensor whose histograms an imported model is to take, a preset or a file (default: iccv2023-train, that of the

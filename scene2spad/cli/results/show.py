@@ -55,13 +55,13 @@ MARKS = {
 @dataclass(frozen=True, kw_only=True)
 class Show(Common):
     """Make a page of a file: point at a pixel and see its returns, expected counts and detections, turn the point
-    cloud, play the light. The page is one file and loads nothing. Or make a picture (.png, .pdf) or an animation
-    (.gif, .mp4). FILE is anything that a command writes, or the name of a model that comes with the package."""
+    cloud, play the light. The page is one file and loads nothing. Or make a picture (.png, .pdf) or an
+    animation (.gif, .mp4). FILE is anything that a command writes, or the name of a model of the package."""
 
     file: Positional[GivenFile]
     """The file, the folder of a set or of a run, or a model's name."""
     out: File = None
-    """File to write: .html, .png, .pdf, .gif or .mp4 (default: room.histogram.html, with the kind, by room.h5)."""
+    """File to write: .html, .png, .pdf, .gif or .mp4 (default: room.histogram.html for a histogram room.h5)."""
     transient: File = None
     """The transient that a histogram was sensed from (default: the .exr beside it, if it is that one)."""
     view: int = 0

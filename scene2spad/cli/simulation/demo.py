@@ -26,7 +26,7 @@ ON_THE_CHIP = ("fourier-1024x1x1-128x-s0", "fourier-learned-256x2x2-128x-s0", NE
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Common):
-    """From the default scene to depth, with a figure: render, sense, and depth from all bins, from Fourier codes and
+    """Go from the default scene to depth, with a figure: render, sense, and depth from all bins, from Fourier codes and
     from learned codes by a network that ships, both at 128x; and what the codes cost on the chip."""
 
     scene: str = "living-room"

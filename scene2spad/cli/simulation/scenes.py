@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from scene2spad.cli.paths import PNG_FIGURE, check_target, keep_foreign
-from scene2spad.options.common import Common, File, Pixels, Positional, only_for, word
+from scene2spad.options.common import Common, File, Pixels, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.library.catalog import SCENES, load_scene
 from scenes.library.sets import SETS, scene_set
@@ -18,7 +18,7 @@ from scenes.progress import Progress
 class Scenes(Common):
     """List the built-in scenes and sets, or describe one: size, triangles, camera, lights, what a loader changed."""
 
-    scene: Positional[Annotated[str, word("[SCENE]")]] = ""
+    scene: Positional[Annotated[str, may_stay_open("[SCENE]")]] = ""
     """A scene as `render` takes it, or with --sheet a set; none lists the names."""
     sheet: File = None
     """Draw a contact sheet of the set's first views to this .png."""
