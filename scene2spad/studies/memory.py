@@ -109,7 +109,7 @@ def statements() -> list[dict[str, object]]:
 
 
 def _statement(claim: str, verdict: str, recomputed: dict[str, float]) -> dict[str, object]:
-    return {"said": claim, "verdict": verdict, "recomputed": recomputed}
+    return {"claim": claim, "verdict": verdict, "recomputed": recomputed}
 
 
 def _draw(table: dict[int, dict[str, np.ndarray]], title: str, path: Path) -> Path:

@@ -127,7 +127,7 @@ def test_study_memory_draws_figures_15_and_16(capfd, tmp_path, monkeypatch):
     assert full[3, 4] == pytest.approx(n / (64 * (b + n / b)))
     thin = np.array(result["ratios"]["memory-separable"]["512"]["in-sensor storage"])
     assert thin[3, 4] == pytest.approx(n / (512 * (b + n / b / 16)))
-    common = {line["said"]: line for line in memory.statements()}
+    common = {line["claim"]: line for line in memory.statements()}
     assert sum(line["verdict"].startswith("off") for line in common.values()) == 2
     worst = [
         v for line in common.values() for key, v in line["recomputed"].items() if "1e+06" in key and "x 4 x 4" in key

@@ -141,7 +141,7 @@ def _drawn(
     lines = []
     for level in sheet.shown:
         maps = [depth_map(store, one.subject, test, view, level, command.seed) for one in mine.values()]
-        lines.append((f"[{level[0]:g}, {level[1]:g}]", test.truth_m(view), maps))
+        lines.append((f"{level[0]:g} + {level[1]:g}", test.truth_m(view), maps))
     labels = [figures.label_of(one) for one in mine.values()]
     path = command.out / f"{command.name}-{sheet.figure}-{sheet.compression}x.png"
     title = f"{sheet.title}, {sheet.compression}x, {TEST_SET}, seed 0"

@@ -115,14 +115,14 @@ def against_compression(
     away."""
     figure, axes = plt.subplots(2, 4, figsize=(15, 7.5), layout="constrained", sharex=True, sharey="col")
     groups = {"low_sbr": "SBR <= 0.1", "high_sbr": "SBR > 0.1"}
-    names = {g: [f"[{s:g}, {b:g}]" for s, b in levels if is_low_sbr(s, b) == (g == "low_sbr")] for g in groups}
+    names = {g: [f"{s:g} + {b:g}" for s, b in levels if is_low_sbr(s, b) == (g == "low_sbr")] for g in groups}
     for row, moved in zip(axes, (0.0, offset_m), strict=True):
         for panel, (figure_of, group) in zip(
             row, [(f, g) for f in ("mae_mm", "within_10mm") for g in groups], strict=True
         ):
             mine = [r for r in summary if r["offset_m"] == moved and r["levels"] == group]
             _lines(panel, mine, figure_of, sorted({r["compression"] for r in summary} - {1}))
-            held = " ".join(names[group]) if len(names[group]) <= 4 else f"{len(names[group])} levels"
+            held = ", ".join(names[group]) if len(names[group]) <= 4 else f"{len(names[group])} levels"
             place = f"{moved:g} m farther" if moved else "as it is"
             panel.set_title(f"{place}, {groups[group]}: {held}", fontsize=9)
             if figure_of == "mae_mm":
@@ -193,7 +193,7 @@ def sweep(found: dict, path: Path) -> Path:
     plain_log(panel)
     panel.set_xlim(first, last)
     levels = _levels([found])
-    panel.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
+    panel.set(xlabel="offset of the scenes in time [m]", ylabel="mean absolute depth error [mm]")
     scenes = f"{found['scenes']} scene{'s' if found['scenes'] != 1 else ''}"
     panel.set_title(f"Error against offset, 128x, seed 0, {scenes}, photons {levels}", fontsize=10)
     panel.grid(alpha=0.3, which="both")
@@ -215,7 +215,7 @@ def range_end(found: dict, path: Path) -> Path:
         left.fill_between(at, low, high, color=f"C{number}", alpha=0.15)
     if found["arms"]:
         plain_log(left)
-        left.set(xlabel="scenes moved away in time by [m]", ylabel="mean absolute depth error [mm]")
+        left.set(xlabel="offset of the scenes in time [m]", ylabel="mean absolute depth error [mm]")
         left.set_title(f"truncated Fourier, 128x, photons {_levels([found])}: mean and span of seeds", fontsize=10)
     for model in dict.fromkeys(row["model"] for row in found["walls"]):
         mine = [row for row in found["walls"] if row["model"] == model]
@@ -225,7 +225,7 @@ def range_end(found: dict, path: Path) -> Path:
         right.plot([r["depth_m"] for r in mine], [r["bias_mm"] for r in mine], label=model, **style)
     right.set_yscale("symlog", linthresh=10)
     right.set(xlabel="depth of the wall [m]", ylabel="mean signed error [mm], linear within 10 mm")
-    right.set_title("a wall, photons [{:g}, {:g}], seed 0".format(*found["wall_level"]), fontsize=10)
+    right.set_title("a wall, photons {:g} + {:g}, seed 0".format(*found["wall_level"]), fontsize=10)
     for panel in panels[0]:
         panel.grid(alpha=0.3)
         panel.legend(fontsize=8)
@@ -269,7 +269,7 @@ def bars_of(cure: Sequence[dict], swap: Sequence[dict], offset_m: float, path: P
 
 
 def _levels(rows: Sequence[dict]) -> str:
-    return ", ".join(f"[{signal:g}, {background:g}]" for signal, background in (rows[0]["levels"] if rows else ()))
+    return ", ".join(f"{signal:g} + {background:g}" for signal, background in (rows[0]["levels"] if rows else ()))
 
 
 def _pairs(panel: Axes, names: Sequence[str], rows: Sequence[dict], offset_m: float) -> None:

@@ -347,7 +347,7 @@ def _depth_images(study: Session, base: TestSet, shown: Sequence[int], out: Path
                         for w in mine
                     }
                     message = f"{base.views.scenes[view].split('/')[-1]}\n{'+7 m' if delay else 'as it is'}\n"
-                    lines.append((f"{message}[{level[0]:g}, {level[1]:g}]", moved.truth_m(view), maps))
+                    lines.append((f"{message}{level[0]:g} + {level[1]:g}", moved.truth_m(view), maps))
         drawn.append(figures.depth_images(lines, ratio, out / f"depth-offset-3-{ratio}x.png"))
     return drawn
 

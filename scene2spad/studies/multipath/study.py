@@ -202,6 +202,8 @@ def draw(means: Sequence[Mapping], scenes: int, path: Path) -> Path:
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
     mean = "mean of " if scenes > 1 else ""
-    dashed = ". Dashed: the same designs, trained on direct light alone" if set(MIXED_NAMES.values()) & set(methods) else ""
+    dashed = (
+        ". Dashed: the same designs, trained on direct light alone" if set(MIXED_NAMES.values()) & set(methods) else ""
+    )
     figure.suptitle(f"Multipath under a flood laser: {mean}{_counted(scenes)}{dashed}", fontsize=11)
     return save(figure, path)
