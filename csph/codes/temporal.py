@@ -12,7 +12,7 @@ instead of bin centres n + 1/2; Gray's band is that of the pulse's published tap
 Every pair of published rows is one of ours, turned and mirrored, so that `csph.codes.decode` finds the same depths.
 The mean over K is another one, and so are zero-normalised back-projections (`csph.layer`) and what networks make of
 them: the largest value of that of 8 codes is, at 10 + 50 photons on the reference sensor, 59 instead of 46 bins off at
-1.2 to 2.9 m, and 30 instead of 33 bins 7 m farther.
+1.3 to 2.9 m, and 30 instead of 33 bins 7 m farther.
 """
 
 from __future__ import annotations

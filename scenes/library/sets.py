@@ -17,8 +17,8 @@ SETS: dict[str, str] = {
     "clutter/train": "edge-rich procedural views, 0.3 to 13 m, without end (short: clutter)",
     "clutter/val": "views that are not in clutter/train",
     "clutter/test": "views that are in neither",
-    "tabletop": "eight still lifes with fine structure, 1.1 to 2.9 m",
-    "middlebury": "reliefs of the Middlebury 2006 scenes found beside the project",
+    "tabletop": "eight still lifes with fine structure, 1.3 to 2.9 m",
+    "middlebury": "reliefs of the Middlebury 2006 scenes found in $SCENE2SPAD_DATA/middlebury",
     "hard-cases": "scenes that break renderers",
 }
 LARGEST = 1_000_000

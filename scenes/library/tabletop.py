@@ -1,4 +1,4 @@
-"""Eight still lifes on a table before a wall, 1.1 to 2.9 m away: coarse bodies and structure finer than a pixel.
+"""Eight still lifes on a table before a wall, 1.3 to 2.9 m away: coarse bodies and structure finer than a pixel.
 
 A test set in the spirit of Middlebury's: spikes, antlers, sticks, handles, books and skittles, each scene with a seed
 of its own that never changes.
