@@ -121,9 +121,8 @@ def draw_transient(transient: Transient, path: Path) -> Path:
     axes[1, 0].imshow(np.abs(transient.normal.astype(float)))
     axes[1, 0].set(title="|normal|, world x y z as red green blue", xticks=[], yticks=[])
     axes[1, 0].title.set_fontsize(10)
-    draw_image(
-        axes[1, 1], display(transient.ambient), "ambient light", "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1
-    )
+    lit = "ambient light" if transient.ambient.any() else "no ambient light"
+    draw_image(axes[1, 1], display(transient.ambient), lit, "relative, gamma 2.2", cmap="gray", vmin=0, vmax=1)
     _mean_transient(axes[1, 2], transient)
     error = transient.meta.get("relative_error", {}).get("total", float("nan"))
     figure.suptitle(f"{transient.meta.get('scene', '')}: {transient.returns:,} returns, estimated error {error:.2%}")
@@ -184,7 +183,7 @@ def draw_depth(histogram: Histogram, depth_m: np.ndarray, method: str, errors: d
     if np.isnan(histogram.depth_m).all():
         figure, (only,), _ = image_row(depth_m.shape, 1)
         title_above(figure, method)
-        draw_image(only, depth_m, "no truth known", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
+        draw_image(only, depth_m, "estimate (no true depth known)", "m", cmap=DEPTH_COLOURS, **depth_limits(depth_m))
         return save(figure, path)
     figure, axes, _ = image_row(depth_m.shape, 3)
     limits = depth_limits(histogram.depth_m)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 
-from scene2spad.plots.figures import DEPTH_COLOURS, depth_limits, draw_depth_row, draw_image
+from scene2spad import transient_from_rgbd
+from scene2spad.plots import figures
+from scene2spad.plots.figures import DEPTH_COLOURS, depth_limits, draw_depth_row, draw_image, draw_transient
 
 
 def room(pixels: int = 64) -> np.ndarray:
@@ -54,3 +56,13 @@ def test_the_colour_bar_of_a_row_points_to_estimates_beyond_it(odd, extend):
         assert row[0].get_title() == "truth" and row[1].get_title() == "one\nMAE 200 mm"
     finally:
         plt.close(figure)
+
+
+@pytest.mark.parametrize(("ambient", "title"), [(0.0, "no ambient light"), (0.02, "ambient light")])
+def test_a_black_panel_says_that_there_is_no_ambient_light(ambient, title, monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure) or path)
+    image = np.ones((4, 4))
+    draw_transient(transient_from_rgbd(2.0 * image, 0.5 * image, ambient * image), tmp_path / "a.png")
+    assert title in [axes.get_title() for axes in drawn[0].get_axes()]
+    plt.close(drawn[0])
