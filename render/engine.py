@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 import math
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -33,6 +31,7 @@ from render.settings import BATCHES, FILTERED_BATCHES, MAX_AMBIENT_SPP, MIN_PIXE
 from render.transient import Transient
 from render.transient.samples import to_returns
 from scenes.errors import require, told_apart
+from scenes.io.versions import installed_versions
 from scenes.json_types import JsonObject
 from scenes.limits import require_memory
 from scenes.model import Scene
@@ -271,10 +270,5 @@ def _meta(scene: Scene, plan: Plan, seed: int, error: ErrorEstimate, traced: Lig
         "clipped_footprints": traced.clipped,
         "relative_error": error.to_dict(),
         "target_met": is_met(error, plan.target),
-        "versions": dict(_versions()),
+        "versions": installed_versions("scene2spad", "mitsuba", "drjit", "numpy"),
     }
-
-
-@cache
-def _versions() -> tuple[tuple[str, str], ...]:
-    return tuple((name, importlib.metadata.version(name)) for name in ("scene2spad", "mitsuba", "drjit", "numpy"))

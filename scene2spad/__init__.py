@@ -164,9 +164,9 @@ _import_name, _names = lazy_names(__name__, _MODULE_OF)
 def __getattr__(name: str) -> object:
     """Import a public name when it is first asked for (PEP 562)."""
     if name == "__version__":
-        from importlib.metadata import version
+        from scenes.io.versions import installed_version
 
-        return version("scene2spad")
+        return installed_version("scene2spad")
     return _import_name(name)
 
 

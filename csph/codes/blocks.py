@@ -145,8 +145,9 @@ class _ZeroNormalise(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, values: Tensor, axis: int, centre: bool, over: tuple[int, ...]) -> Tensor:
         unit = values - mean_over(values, axis) if centre else values.clone()
-        norm = (unit * unit).sum((axis, *over), keepdim=True).sqrt_()
-        unit.div_(norm + EPSILON)
+        norm = (unit * unit).sum((axis, *over), keepdim=True).sqrt()
+        # compiled by torch 2.11, a result that was written in place has derivatives of 0
+        unit = unit / (norm + EPSILON) if torch.compiler.is_compiling() else unit.div_(norm + EPSILON)
         ctx.save_for_backward(unit, norm)
         ctx.axis, ctx.centre, ctx.over = axis, centre, over
         return unit

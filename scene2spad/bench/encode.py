@@ -3,7 +3,6 @@ of encoding photon timestamps with and without building a histogram. Same tensor
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import os
 import platform
@@ -26,6 +25,7 @@ from csph.codes.photons import encode_photons, photon_table
 from scene2spad.options.experiments import Bench
 from scenes.errors import require
 from scenes.files import whole_file, write_csv
+from scenes.io.versions import installed_versions
 from scenes.progress import Progress
 from spad.measurements.histogram import counts_from_timestamps
 
@@ -215,7 +215,7 @@ def _write(rows: list[Row], folder: Path) -> dict[str, str]:
         "processor": platform.processor() or platform.machine(),
         "cpus": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "versions": {name: importlib.metadata.version(name) for name in ("scene2spad", "torch")},
+        "versions": installed_versions("scene2spad", "torch"),
     }
     names = {key: str(folder / f"bench-encode.{ending}") for key, ending in (("csv", "csv"), ("results", "json"))}
     write_csv([asdict(row) for row in rows], Path(names["csv"]))

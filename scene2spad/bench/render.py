@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import logging
 import os
@@ -23,6 +22,7 @@ from scene2spad.bench.rendering.settings import BIN_M, BINS, BOUNCES, METHODS
 from scene2spad.options.experiments import Bench
 from scenes.errors import InputError
 from scenes.files import finite, whole_file, write_csv
+from scenes.io.versions import installed_versions
 from scenes.model import Scene
 from scenes.progress import Progress
 
@@ -147,7 +147,7 @@ def _reference(
         "bin_m": BIN_M,
         "spp": spp,
         "maker": "mitransient multijitter" if with_peer else "ours",
-        "versions": {name: importlib.metadata.version(name) for name in names},
+        "versions": installed_versions(*names),
     }
     pixels = case.size**2
     if with_peer:
@@ -233,8 +233,11 @@ def _write(rows: list[Row], command: Bench) -> dict:
 
 def _machine(with_peer: bool) -> dict:
     names = ("scene2spad", "mitsuba", "drjit", "numpy", *(("mitransient",) if with_peer else ()))
-    versions = {name: importlib.metadata.version(name) for name in names}
-    return {"processor": platform.processor() or platform.machine(), "cpus": os.cpu_count(), "versions": versions}
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cpus": os.cpu_count(),
+        "versions": installed_versions(*names),
+    }
 
 
 def _table(rows: list[Row]) -> list[str]:

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from functools import reduce
-from importlib.metadata import version
 from operator import or_
 from types import ModuleType
 from typing import Annotated
@@ -27,6 +26,7 @@ from scene2spad.interrupts import stopped
 from scene2spad.options.common import Common, flow_help
 from scenes.errors import InputError, did_you_mean, require
 from scenes.files import finite
+from scenes.io.versions import installed_version
 from scenes.progress import Progress
 
 log = logging.getLogger("scene2spad")
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
     """Run one command and return the exit status: 0 done, 2 bad input, 130 interrupted. Bad input never raises."""
     try:
         if argv == ["--version"]:
-            print(f"scene2spad {version('scene2spad')}")
+            print(f"scene2spad {installed_version('scene2spad')}")
             return 0
         if argv[:1] == ["--completion"]:
             return _print_completion(argv[1:])

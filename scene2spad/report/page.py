@@ -7,7 +7,6 @@ is absent or cannot be read costs a line in the page, never the page.
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
@@ -24,6 +23,7 @@ from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.io.inputs import read_json_object
 from scenes.io.set_index import read_set_index
+from scenes.io.versions import installed_versions
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 
@@ -236,14 +236,11 @@ def _smoke(found: Found) -> list[str]:
 
 
 def _configurations(found: Found) -> Iterator[str]:
-    versions = [{"what": "Python", "version": platform.python_version()}]
-    for name in PACKAGES:
-        try:
-            versions.append({"what": name, "version": importlib.metadata.version(name)})
-        except importlib.metadata.PackageNotFoundError:
-            versions.append({"what": name, "version": "not installed"})
+    versions = {"Python": platform.python_version(), **installed_versions(*PACKAGES)}
     found.tables += 1
-    yield html.table(versions, "Versions that this page was made with")
+    yield html.table(
+        [{"what": name, "version": one} for name, one in versions.items()], "Versions that this page was made with"
+    )
     for name in ("bench-render.json", "bench-encode.json"):
         path = found.newest(name)
         machine = ((found.read(path, read_json_object) if path else None) or {}).get("machine")

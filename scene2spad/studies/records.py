@@ -9,13 +9,13 @@ import json
 import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 from scene2spad.options.experiments import NO_PRESET, Study
 from scenes.errors import InputError, require
 from scenes.files import whole_file
 from scenes.io.inputs import file_sha256, read_json_object
+from scenes.io.versions import installed_version
 from scenes.json_types import JsonObject
 
 log = logging.getLogger("scene2spad")
@@ -56,7 +56,7 @@ def record_path(command: Study) -> Path:
 def asked_of(command: Study) -> JsonObject:
     """Return all that decides a study's results, but for what it finds in folders, as JSON has it."""
     options = asdict(replace(command, json=False, dry_run=False, ship=False))
-    return json.loads(json.dumps({**options, "version": version("scene2spad")}, default=str))
+    return json.loads(json.dumps({**options, "version": installed_version("scene2spad")}, default=str))
 
 
 def read_record(path: Path) -> StudyRecord:

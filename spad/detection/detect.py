@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-from functools import lru_cache
 from typing import Literal
 from weakref import WeakKeyDictionary
 
@@ -11,6 +9,7 @@ import numpy as np
 
 from render.transient import Transient
 from scenes.errors import InputError
+from scenes.io.versions import installed_versions
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
 from spad.detection.detectors import LAWS
@@ -138,7 +137,7 @@ def _planned(
         "brightest_thousandth": fractions.brightest_thousandth,
         "median_signal": fractions.median,
         "transient": {**transient.meta, "sha256": _sha256(transient)},
-        "versions": _versions(),
+        "versions": installed_versions("scene2spad", "numpy", "torch"),
     }
     truth = {
         "depth_m": transient.depth_m,
@@ -164,11 +163,6 @@ def _sha256(transient: Transient) -> str:
     if transient not in _HASHES:
         _HASHES[transient] = transient.sha256()
     return _HASHES[transient]
-
-
-@lru_cache(maxsize=1)
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in ("scene2spad", "numpy", "torch")}
 
 
 def mean_pixel_law(sensor: Sensor, budget: PhotonBudget) -> tuple[str, float]:

@@ -8,7 +8,6 @@ import logging
 import os
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy as np
 from scene2spad.bench.rendering.errors import Reference
 from scenes.errors import InputError
 from scenes.files import read_arrays, whole_file
+from scenes.io.versions import installed_version
 
 log = logging.getLogger("scene2spad")
 FORMAT = 3  # of what is kept, renders of studies too: another number forgets them within a version
@@ -29,7 +29,7 @@ def default_folder() -> Path:
 def key_of(parts: dict) -> str:
     """Return a hash of everything that decides a render that is kept (plain JSON values), this version's code among
     it."""
-    whole = {**parts, "format": FORMAT, "version": version("scene2spad")}
+    whole = {**parts, "format": FORMAT, "version": installed_version("scene2spad")}
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:20]
 
 
