@@ -13,9 +13,9 @@ import numpy as np
 
 from scenes.errors import InputError, require
 from ultraphase.assembly.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
-from ultraphase.assembly.program import Program
+from ultraphase.assembly.program import Program, block_ends
 from ultraphase.chip import ChipSpec, array_shape, chosen_chip
-from ultraphase.core import WATCHDOG_STEPS, Core, Counters, block_ends, region_contents, require_loadable
+from ultraphase.core import WATCHDOG_STEPS, Core, Counters, region_contents, require_loadable, require_progress
 from ultraphase.port import core_offsets, port_timestamps
 
 _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
@@ -134,7 +134,7 @@ class ArrayRun:
         self.link_full = np.zeros((len(STEPS), lanes), bool)
         self.link_time = np.zeros((len(STEPS), lanes), np.int64)  # when it was last filled or emptied
         self.visits = np.zeros(len(self.program.instructions), np.int64)
-        self.wraps = self.saturations = self.events = 0
+        self.wraps = self.saturations = self.events = self.words = 0
         self.out: list[np.ndarray] = []  # (core, word, bits) of those that left at one instruction
         self.ram_bytes = self.program.ram_bytes
         self.changed = True  # the status of some core
@@ -161,8 +161,7 @@ class ArrayRun:
             self._block(word, slice(None) if index.size == self.status.size else index, index)
             patience = WATCHDOG_STEPS if self.events != events else patience - 1
             events = self.events
-            if patience == 0:
-                raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
+            require_progress(self.program, word, patience, self.words, self.status.size, self.port.size)
         self._explain_waiting()
         return self._result()
 
@@ -296,7 +295,7 @@ class ArrayRun:
         value, size = self.registers[one.rs][lanes], high - low + 1
         self.wraps += _outside(value, low, high)
         self.out.append(np.stack(np.broadcast_arrays(index, (value - low) % size + low, size.bit_length() - 1)))
-        self.events += 1
+        self.events, self.words = self.events + 1, self.words + index.size
 
     def _outb(self, one: Instruction, word: int, lanes: slice | np.ndarray, index: np.ndarray) -> None:
         self._leave(one, lanes, index, 0, BYTE_LIMIT)

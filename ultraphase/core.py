@@ -18,6 +18,9 @@ from ultraphase.chip import ChipSpec, chosen_chip, whole_pair
 from ultraphase.port import port_timestamps
 
 WATCHDOG_STEPS = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
+# Words that a core may put out in a frame, and more for each photon, which programs that send photons on put out. Those
+# that put out more never end.
+MAX_WORDS, WORDS_PER_PHOTON = 1 << 16, 16
 _STOP = -1
 
 
@@ -215,8 +218,8 @@ class Core:
                         self.word, self._stopped = stretch.end, True
                         return
                     word = after
-                if progress == (self._read, len(self.out)):
-                    raise InputError(f"{self.program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
+                left = int(progress != (self._read, len(self.out)))
+                require_progress(self.program, word, left, len(self.out), 1, len(self._port))
         finally:
             for first, stretch in stretches.items():
                 for done in range(first, stretch.end + 1):
@@ -301,22 +304,21 @@ def require_loadable(program: Program, tables: Mapping[str, np.ndarray] | None, 
     require(named, f"{where}: tables of type {type(tables).__name__}, expected contents by name")
 
 
+def require_progress(program: Program, word: int, patience: int, words: int, cores: int, photons: int) -> None:
+    """Raise InputError where `patience` is 0, or more words left the sensor than a frame of so many photons has."""
+    require(patience > 0, f"{program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
+    most = MAX_WORDS * cores + WORDS_PER_PHOTON * photons
+    message = (
+        f"the frame does not end: more than {MAX_WORDS} words a core, and {WORDS_PER_PHOTON} a photon, left the sensor"
+    )
+    require(words <= most, f"{program.where(word)}: {message}")
+
+
 @lru_cache(maxsize=4096)
 def _compiled(statements: str) -> CodeType:
     """Compile statements into a function `does`, for any core."""
     text = "def does():\n    " + statements.replace("\n", "\n    ")
     return compile(text, "<instructions>", "exec")
-
-
-def block_ends(program: Program) -> list[int]:
-    """Return for every word the first one behind its basic block."""
-    starts = set(program.labels.values()) | {one.target for one in program.instructions if "l" in one.op.takes}
-    ends = [0] * len(program.instructions)
-    for word in reversed(range(len(ends))):
-        one = program.instructions[word]
-        parts = "l" in one.op.takes or one.name in ("HALT", "SEND", "RECV") or word + 1 in starts
-        ends[word] = word + 1 if parts or word + 1 == len(ends) else ends[word + 1]
-    return ends
 
 
 def region_contents(program: Program, ram: np.ndarray, region: str) -> np.ndarray:

@@ -198,9 +198,11 @@ def test_watch_shows_each_change():
         ("MOV r1, #1", "runs behind its last instruction"),
         ("a: JMP a", "no progress"),
         ("a: BNT a\nHALT", "no progress"),
+        ("a: OUTB r1\nJMP a", "the frame does not end: more than 500 words a core, and 16 a photon, left the sensor"),
     ],
 )
-def test_core_and_array_refuse_alike(source, message):
+def test_core_and_array_refuse_alike(source, message, monkeypatch):
+    monkeypatch.setattr("ultraphase.core.MAX_WORDS", 500)
     code = assemble(".space data, u8, 64\n" + source, name="p")
     stream = [] if source.startswith("a:") else [1]
     for run in (

@@ -212,3 +212,14 @@ def disassemble(words: tuple[int, ...], regions: tuple[Region, ...] = ()) -> str
         lines.append(f"        {format_instruction(instruction, lambda target: f'{start}{target}')}")
     lines += [f"{start}{target}:" for target in targets if target == len(instructions)]
     return "\n".join(lines) + "\n"
+
+
+def block_ends(program: Program) -> list[int]:
+    """Return for every word the first one behind its basic block."""
+    starts = set(program.labels.values()) | {one.target for one in program.instructions if "l" in one.op.takes}
+    ends = [0] * len(program.instructions)
+    for word in reversed(range(len(ends))):
+        one = program.instructions[word]
+        parts = "l" in one.op.takes or one.name in ("HALT", "SEND", "RECV") or word + 1 in starts
+        ends[word] = word + 1 if parts or word + 1 == len(ends) else ends[word + 1]
+    return ends
