@@ -290,6 +290,23 @@ def test_a_card_says_what_was_not_recorded(capfd):
     assert json.loads(capfd.readouterr().out)["errors"] == {}
 
 
+def test_the_models_are_a_table_and_each_limit_stands_once(capfd):
+    """Every model had a line of 300 letters with the same two limits."""
+    assert main(["models", "--json"]) == 0
+    cards = json.loads(capfd.readouterr().out)["models"]
+    assert main(["models"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    rows, limits = lines[2 : 2 + len(cards)], lines[3 + len(cards) : -1]
+    assert [row.split()[0] for row in rows] == [card["name"] for card in cards]
+    at = lines[1].index("compression")
+    assert [row[at:].split()[0] for row in rows] == [f"{card['compression']:g}x" for card in cards]
+    said = [limit.rpartition(" (")[0].strip() for limit in limits]
+    assert len(said) == len(set(said)) and [limit.endswith(" (all)") for limit in limits[:3]] == [True, True, False]
+    for card in cards:
+        own = [limit for limit in limits if card["name"] in limit.rpartition(" (")[2] or limit.endswith(" (all)")]
+        assert len(own) == len(card["not_for"])
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_names_what_a_command_takes(name, capsys):
     """No argument is called by its type: the texts of the help speak of files, scenes and models."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from scene2spad.cli.checks import CHECKPOINT
 from scene2spad.cli.paths import output_folder
@@ -14,6 +14,9 @@ from scenes.errors import InputError, require
 from scenes.io.inputs import regular_file
 from scenes.json_types import JsonObject
 from scenes.progress import Progress
+
+if TYPE_CHECKING:
+    from csph.weights.cards import Card
 
 log = logging.getLogger("scene2spad")
 IMPORT = "import"
@@ -37,8 +40,7 @@ class Models(Common):
 
 
 def run(command: Models, progress: Progress) -> dict:
-    """Run the command: cards of the shipped models, a line each, or one's whole; or a published checkpoint as a
-    model."""
+    """Run the command: a table of the shipped models, or one's whole card; or a published checkpoint as a model."""
     if command.name == IMPORT:
         return _import(command)
     if command.file or command.sensor or command.out:
@@ -52,14 +54,40 @@ def run(command: Models, progress: Progress) -> dict:
     found = cards()
     if command.json:
         return {"models": [card.to_dict() for card in found]}
-    lines = []
-    for card in found:
-        error = "no error recorded" if card.val_mae_mm is None else f"validation MAE {card.val_mae_mm:.1f} mm"
-        message = (
-            f"{card.name}: {card.model}, {card.compression:g}x; {', '.join(card.training)}; {card.levels}; {error}"
+    note = (
+        "their validation sets differ: `scene2spad evaluate` compares them; `scene2spad models NAME` shows a whole card"
+    )
+    return {"models": _table(found), "not for": _limits(found), "note": note}
+
+
+def _table(found: list[Card]) -> list[str]:
+    """Return the cards as aligned lines: what tells the models apart."""
+    head = ("model", "compression", "network", "training sets", "photon levels of training", "validation MAE")
+    rows = [
+        (
+            card.name,
+            f"{card.compression:g}x",
+            card.model.rpartition(", ")[2],
+            " ".join(Path(name).stem for name in card.training),
+            card.levels,
+            UNKNOWN if card.val_mae_mm is None else f"{card.val_mae_mm:.1f} mm",
         )
-        lines.append(f"{message}; not for {'; '.join(card.not_for)}")
-    return {"models": lines}
+        for card in found
+    ]
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    return [
+        "  ".join(f"{text:<{wide}}" for text, wide in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)
+    ]
+
+
+def _limits(found: list[Card]) -> list[str]:
+    """Return what models must not be used for, each limit once: first those of all, then others with their models."""
+    names: dict[str, list[str]] = {}
+    for card in found:
+        for limit in card.not_for:
+            names.setdefault(limit.replace(f" ({card.levels})", ""), []).append(card.name)
+    ordered = sorted(names.items(), key=lambda item: -len(item[1]))
+    return [f"{limit} ({'all' if len(which) == len(found) else ', '.join(which)})" for limit, which in ordered]
 
 
 def _readable(card: JsonObject) -> JsonObject:
