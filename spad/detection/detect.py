@@ -105,7 +105,8 @@ def _planned(
         raise InputError(f"detection model {model!r} is unknown, expected one of {', '.join(MODELS)}")
     rates = rates_for(transient, sensor, budget, dark_map_hz=dark_map_hz, seed=seed)
     light = light_of(transient, sensor, rates, slice(0, transient.height * transient.width))
-    signal, wrapped = expected_signal(transient, sensor, rates, light)
+    signal, wrapped = expected_signal(light, sensor)
+    signal = signal.reshape(transient.height, transient.width)
     # background falls on the whole period, also where it has no bins
     background = rates.background * (sensor.bins / sensor.bins_per_period)
     all_light = light.signal_per_pixel()

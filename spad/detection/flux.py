@@ -145,6 +145,25 @@ def arrivals_per_bin(
     return signal.reshape(count, recorded), wrapped
 
 
+def recorded_fraction(near_s: Tensor, length_s: Tensor, sensor: Sensor) -> Tensor:
+    """Return the share of each return's light that arrives within the sensor's bins, (N,) float64.
+
+    near_s, length_s   begin of its arrival after the laser's emission, and length, (N,) float64 [s]
+
+    The sum of `signal_per_bin` over equal bins, from the record's two ends in each period alone.
+    """
+    record, period = (bins * sensor.bin_width_s for bins in (sensor.bins, sensor.bins_per_period))
+    before, after = sensor.response.window_s(WINDOW_SIGMAS)
+    first, last = torch.floor((near_s - before) / period), torch.floor((near_s + length_s + after) / period)
+    fraction = torch.zeros_like(near_s)
+    for turn in range(int(first.min()), int(last.max()) + 1) if len(near_s) else ():
+        rows = torch.nonzero((first <= turn) & (turn <= last)).squeeze(1)
+        begin, length = turn * period - near_s[rows], length_s[rows]
+        by_end = interval_cdf(sensor.response, begin + record, length)
+        fraction[rows] += (by_end - interval_cdf(sensor.response, begin, length)).clamp(min=0)
+    return fraction
+
+
 def expected_counts(
     transient: Transient, sensor: Sensor, rates: Rates, pixels: slice, device: str = "cpu"
 ) -> tuple[Tensor, float]:

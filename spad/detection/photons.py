@@ -16,7 +16,7 @@ from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from spad.detection.rates import Rates
 from spad.sensor.model import Sensor
 
-GATED_PIXELS = 1024  # whose rates are held at once
+RETURNS_AT_ONCE = 1 << 18  # whose share within the record is computed
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
@@ -133,20 +133,21 @@ def _uniform_bins(rng: np.random.Generator, period: int, size: int) -> np.ndarra
     return words.view(np.uint16)[:size] & np.uint16(period - 1)
 
 
-def expected_signal(transient: Transient, sensor: Sensor, rates: Rates, light: PixelFlux) -> tuple[np.ndarray, float]:
-    """Return expected primary signal detections within the bins of every pixel, (H, W), and how much of the light
+def expected_signal(light: PixelFlux, sensor: Sensor) -> tuple[np.ndarray, float]:
+    """Return expected primary signal detections within the bins of every pixel, (P,), and how much of the light
     wrapped."""
-    shape = (transient.height, transient.width)
     if sensor.bins == sensor.bins_per_period:
-        return light.signal_per_pixel().reshape(shape), late_signal(light, sensor)
-    from spad.detection.flux import expected_counts
+        return light.signal_per_pixel(), late_signal(light, sensor)
+    import torch
 
-    inside = np.empty(light.pixels)
-    for first in range(0, light.pixels, GATED_PIXELS):
-        pixels = slice(first, min(first + GATED_PIXELS, light.pixels))
-        steady = light.background[pixels] * (sensor.bins / sensor.bins_per_period)
-        inside[pixels] = expected_counts(transient, sensor, rates, pixels)[0].sum(dim=1).numpy() - steady
-    return np.clip(inside, 0, None).reshape(shape), late_signal(light, sensor)
+    from spad.detection.flux import recorded_fraction
+
+    inside = np.empty(len(light.signal))
+    for first in range(0, len(inside), RETURNS_AT_ONCE):
+        some = slice(first, first + RETURNS_AT_ONCE)
+        near, length = (torch.from_numpy(bins[some] * sensor.bin_width_s) for bins in (light.start, light.length))
+        inside[some] = light.signal[some] * recorded_fraction(near, length, sensor).numpy()
+    return np.bincount(light.owner, inside, minlength=light.pixels), late_signal(light, sensor)
 
 
 def late_signal(light: PixelFlux, sensor: Sensor) -> float:

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from render.transient import Transient
 from scenes import InputError
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
-from spad.detection.flux import expected_counts, signal_per_bin
+from spad.detection.flux import expected_counts, recorded_fraction, signal_per_bin
 from spad.detection.rates import rates_for
 from spad.sensor.model import PhotonBudget, Pulse, Sensor
 from spad.sensor.template import binned_pulse, pulse_cdf
+from spad.sensor_names import sensor_by_name
 
 REFERENCE = Sensor()
 
@@ -84,6 +85,30 @@ def test_bins_that_do_not_cover_the_period_lose_the_rest():
     gated = Sensor(bins=512, period_s=REFERENCE.period_s)
     assert binned(5.0, 5.0, gated).sum() == pytest.approx(1, abs=1e-9)
     assert binned(25.0, 25.0, gated).sum() == pytest.approx(0, abs=1e-9)
+
+
+RECORDS = {
+    "half a period": Sensor(bins=512, period_s=REFERENCE.period_s),
+    "pulse wider than the record": Sensor(bins=64, period_s=REFERENCE.period_s, pulse=Pulse(9e-9)),
+    "tail over periods": Sensor(bins=300, period_s=5e-8, pulse=Pulse(2e-10, tail_s=2e-8)),
+    "measured pulse": replace(sensor_by_name("iccv2023-train"), period_s=1536 * 80e-12),
+    "swissspad3": sensor_by_name("swissspad3"),
+}
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_light_within_a_record_is_the_sum_over_its_bins(name):
+    """By the record's ends alone, which is some hundred times faster than by its bins."""
+    sensor, random = RECORDS[name], np.random.default_rng(4)
+    near = random.uniform(0, 3 * C * sensor.period_s, 200)
+    near[:4] = C * np.array([0, sensor.bins * sensor.bin_width_s, sensor.period_s, 1e-12])
+    far = near + np.where(random.random(200) < 0.5, 0, random.gamma(0.5, 0.4 * C * sensor.period_s, 200))
+    pixels = [[(a, b, r)] for a, b, r in zip(near, far, random.uniform(0.5, 2, 200), strict=True)]
+    transient = transient_of(*pixels)
+    by_bins = signal_per_bin(transient, sensor, slice(0, 200))[0].sum(dim=1)
+    near_s, far_s = (torch.from_numpy(p.astype(float) / C) for p in (transient.path_near_m, transient.path_far_m))
+    found = recorded_fraction(near_s, far_s - near_s, sensor) * torch.from_numpy(transient.radiance.astype(float))
+    assert (found - by_bins).abs().max() < 1e-9 and 0.05 < float(found.sum() / transient.radiance.sum()) < 0.95
 
 
 def test_time_wraps_at_the_period_and_what_wraps_is_counted():
