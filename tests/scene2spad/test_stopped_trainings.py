@@ -7,10 +7,15 @@ from pathlib import Path
 import pytest
 
 from render.transient.packs import write_pack
+from scene2spad.cli.simulation.depth import Depth
+from scene2spad.cli.simulation.depth import run as run_depth
 from scene2spad.datasets.planes import wall
 from scene2spad.networks.evaluating import run_evaluate
 from scene2spad.networks.training import run_train
 from scene2spad.options.networks import Evaluate, Train
+from spad.detection.detect import sense
+from spad.measurements.histogram import write_histogram
+from spad.sensor.model import PhotonBudget, Sensor
 
 TRAIN = Train(preset="smoke", network="compact", threads=1, out=Path("run"))
 EVALUATE = Evaluate(checkpoints=(Path("run"),), set=Path("wall.h5"), levels=("50+1",), baselines=())
@@ -38,14 +43,19 @@ def stopped(tmp_path, monkeypatch) -> None:
         run_train(TRAIN, stop_in_the_last_epoch)
 
 
-def test_evaluations_and_trainings_that_begin_with_a_stopped_run_say_so_until_it_ends(stopped, caplog):
+def test_commands_that_take_a_stopped_run_say_so_until_it_ends(stopped, caplog):
+    histogram = sense(wall(2.0, 8), Sensor(), PhotonBudget(50, 1), seed=1)
+    write_histogram(histogram, Path("wall.sensed.h5"))
+
     def told(out: str) -> list[str]:
+        depth = Path(f"{out}.exr")
         caplog.clear()
         with caplog.at_level(logging.WARNING, "scene2spad"):
             run_evaluate(EVALUATE, quietly)
             run_train(replace(TRAIN, init="run", out=Path(out), steps=1), quietly)
+            run_depth(Depth(file=Path("wall.sensed.h5"), method="network", checkpoint=Path("run"), out=depth), quietly)
         return [line for line in caplog.messages if "come to its end" in line]
 
-    assert told("next") == [WARNING, WARNING]
+    assert told("next") == [WARNING] * 3
     run_train(TRAIN, quietly)
     assert told("other") == []

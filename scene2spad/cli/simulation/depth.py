@@ -316,10 +316,11 @@ def _network(command: Depth) -> DepthModel | None:
         return None
     from csph.networks.checkpoint import load_model
     from csph.weights.cards import shipped_model
-    from scene2spad.networks.end_warnings import warn_of_ends
+    from scene2spad.networks.end_warnings import warn_of_ends, warn_of_unfinished
 
     checkpoint = command.checkpoint if command.model is None else shipped_model(command.model)
     assert checkpoint is not None
     model = load_model(checkpoint)[0]
+    warn_of_unfinished(checkpoint)
     warn_of_ends(command.model or str(checkpoint), model.config, command.decoder)
     return model
