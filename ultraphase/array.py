@@ -342,7 +342,7 @@ class ArrayRun:
         """Hold cores that cannot go on at this instruction; those at the other end of a moved word try again."""
         self.status[lanes], self.word[lanes], self.changed = _BLOCKED, word, True
         self.status[wake[self.status[wake] == _BLOCKED]] = _RUNS
-        self.events += bool(wake.size)
+        self.events, self.words = self.events + bool(wake.size), self.words + wake.size
         return lanes
 
     def _name(self, lane: int) -> str:

@@ -18,8 +18,8 @@ from ultraphase.chip import ChipSpec, chosen_chip, whole_pair
 from ultraphase.port import port_timestamps
 
 WATCHDOG_STEPS = 1 << 14  # instructions without a timestamp read, a word out or an end, after which a core is stuck
-# Words that a core may put out in a frame, and more for each photon, which programs that send photons on put out. Those
-# that put out more never end.
+# Words that may leave a core in a frame, off the sensor or over a link, and more for each photon, as of programs that
+# send photons on. Those of which more leave never end.
 MAX_WORDS, WORDS_PER_PHOTON = 1 << 16, 16
 _STOP = -1
 
@@ -305,12 +305,10 @@ def require_loadable(program: Program, tables: Mapping[str, np.ndarray] | None, 
 
 
 def require_progress(program: Program, word: int, patience: int, words: int, cores: int, photons: int) -> None:
-    """Raise InputError where `patience` is 0, or more words left the sensor than a frame of so many photons has."""
+    """Raise InputError where `patience` is 0, or more words left the cores than a frame of so many photons has."""
     require(patience > 0, f"{program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
     most = MAX_WORDS * cores + WORDS_PER_PHOTON * photons
-    message = (
-        f"the frame does not end: more than {MAX_WORDS} words a core, and {WORDS_PER_PHOTON} a photon, left the sensor"
-    )
+    message = f"the frame does not end: more than {MAX_WORDS} words a core, and {WORDS_PER_PHOTON} a photon, left cores"
     require(words <= most, f"{program.where(word)}: {message}")
 
 

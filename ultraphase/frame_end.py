@@ -16,11 +16,13 @@ from ultraphase.catalog import Method
 from ultraphase.chip import ChipSpec
 from ultraphase.core import Core
 from ultraphase.products import Tabulated
-from ultraphase.tables import INT8_SCALE, spatial_sum
+from ultraphase.tables import INT8_SCALE, spatial_sum, weighted_sum
 
 LINKS = ("SEND", "RECV")
 _BRIGHT, _PHOTONS = 4, 300  # cores with so many photons; all others have one
 _APART = 100  # photons that come one by one
+_STEP, _ROUNDED = 128, (63, 64)  # of a block's sum, and what is left of it where rounding changes
+_FEW, _TRIED = 20, 2000  # photons a core, and frames of them that are tried for such sums
 _PAUSE = 2000  # clocks from one to the next, at most: many turns of an idle loop
 
 
@@ -128,8 +130,8 @@ def _named(
 
 def require_block_end(method: Method, temporal: np.ndarray, seed: int = 0) -> None:
     """Raise InputError unless a block of the catalogue's cores puts out the weighted sum of its photons, for random
-    weights, and again after another frame; also a sum that leaves 16 bits, at both ends. A method of single cores
-    `verify` has run to the end."""
+    weights, and again after another frame; also a sum that leaves 16 bits, at both ends, and sums that are the last to
+    be rounded down and the first to be rounded up. A method of single cores `verify` has run to the end."""
     if method.block == (1, 1):
         return
     random, program = np.random.default_rng(seed), method.program()
@@ -140,9 +142,17 @@ def require_block_end(method: Method, temporal: np.ndarray, seed: int = 0) -> No
     one, other = (random.integers(0, matrix.shape[1], (cores, _PHOTONS)) for _ in range(2))
     bright = HALF_LIMITS[1] // int(np.abs(matrix[0]).max())  # photons that a core's own sum still holds
     top, bottom = (np.full((cores, bright), end) for end in (matrix[0].argmax(), matrix[0].argmin()))
-    for stamps in (one, one, other, one, top, bottom, one):
+
+    def sums_of(stamps: np.ndarray) -> np.ndarray:
+        return matrix[:, stamps].sum(axis=-1).T.reshape(cores, -1, method.codes)
+
+    def rests_of(stamps: np.ndarray) -> np.ndarray:
+        return weighted_sum(sums_of(stamps), weights.reshape(cores, method.codes)) % _STEP
+
+    some = [random.integers(0, matrix.shape[1], (cores, _FEW)) for _ in range(_TRIED)]
+    edges = [next((stamps for stamps in some if (rests_of(stamps) == rest).any()), one) for rest in _ROUNDED]
+    for stamps in (one, one, other, one, top, bottom, *edges, one):
         frame = array.frame(stamps.reshape(-1), np.arange(cores + 1) * stamps.shape[1])
-        sums = matrix[:, stamps].sum(axis=-1).T.reshape(cores, -1, method.codes)
-        right = spatial_sum(sums, weights.reshape(cores, method.codes)).reshape(1, -1)
+        right = spatial_sum(sums_of(stamps), weights.reshape(cores, method.codes)).reshape(1, -1)
         same = np.array_equal(frame.out, right)
         require(same, f"program {program.name}: a block of cores puts out other than the weighted sum of its photons")

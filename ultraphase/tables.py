@@ -114,8 +114,7 @@ def spatial_sum(sums: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
     sums (..., cores, blocks, K) and weights (cores, K), both integer -> (..., blocks, K) int64.
     """
-    total = (np.asarray(sums, np.int64) * np.asarray(weights, np.int64)[:, None, :]).sum(axis=-3)
-    return ((total + 64) >> 7).clip(-(1 << 15), (1 << 15) - 1)
+    return ((weighted_sum(sums, weights) + 64) >> 7).clip(-(1 << 15), (1 << 15) - 1)
 
 
 def block_sum(sums: np.ndarray, weights: np.ndarray | None, shift: int) -> np.ndarray:
@@ -123,6 +122,11 @@ def block_sum(sums: np.ndarray, weights: np.ndarray | None, shift: int) -> np.nd
 
     sums and weights as of `spatial_sum`; weights None: of s / 2^shift.
     """
+    return (weighted_sum(sums, weights) + (1 << shift >> 1)) >> shift
+
+
+def weighted_sum(sums: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Return the sum over the cores of w s, or of s, before it is divided: (..., cores, blocks, K) and (cores, K) ->
+    (..., blocks, K) int64."""
     held = np.asarray(sums, np.int64)
-    total = (held if weights is None else held * np.asarray(weights, np.int64)[:, None, :]).sum(axis=-3)
-    return (total + (1 << shift >> 1)) >> shift
+    return (held if weights is None else held * np.asarray(weights, np.int64)[:, None, :]).sum(axis=-3)

@@ -198,7 +198,7 @@ def test_watch_shows_each_change():
         ("MOV r1, #1", "runs behind its last instruction"),
         ("a: JMP a", "no progress"),
         ("a: BNT a\nHALT", "no progress"),
-        ("a: OUTB r1\nJMP a", "the frame does not end: more than 500 words a core, and 16 a photon, left the sensor"),
+        ("a: OUTB r1\nJMP a", "the frame does not end: more than 500 words a core, and 16 a photon, left cores"),
     ],
 )
 def test_core_and_array_refuse_alike(source, message, monkeypatch):

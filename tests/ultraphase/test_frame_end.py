@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scenes.errors import InputError
-from ultraphase import assemble, method, verify
+from ultraphase import Method, assemble, method, verify
 from ultraphase.catalog import FOLDER
 from ultraphase.frame_end import require_block_end
 from ultraphase.tables import int8_codes
@@ -84,6 +84,17 @@ def test_a_block_whose_sum_lost_a_limit_is_refused(monkeypatch, tmp_path, lost):
     monkeypatch.setattr("ultraphase.catalog.FOLDER", tmp_path)
     with pytest.raises(InputError, match="separable-8: a block of cores puts out other than the weighted sum"):
         require_block_end(method("separable-8"), waves(8, 256))
+
+
+@pytest.mark.parametrize("half", [63, 65])
+def test_a_block_whose_sum_is_rounded_from_another_half_is_refused(monkeypatch, tmp_path, half):
+    """One sum of 128 tells the two apart; programs off by 2 and by 4 of 128 were called proved."""
+    for path in FOLDER.iterdir():
+        if path.suffix == ".s":
+            (tmp_path / path.name).write_text(path.read_text().replace("ADD  a, a, #64", f"ADD  a, a, #{half}"))
+    monkeypatch.setattr("ultraphase.catalog.FOLDER", tmp_path)
+    with pytest.raises(InputError, match="separable-2: a block of cores puts out other than the weighted sum"):
+        require_block_end(Method("separable", 2), waves(2, 256))
 
 
 @pytest.mark.parametrize(
