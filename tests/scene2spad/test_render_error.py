@@ -103,7 +103,7 @@ def test_renders_of_other_code_or_other_files_are_made_again(capfd, tmp_path, mo
     for place, value, files in (
         ("scene2spad.bench.rendering.references.FORMAT", references.FORMAT, 4),
         ("scene2spad.datasets.rendering.THINNED", 0.03, 8),
-        ("scene2spad.bench.rendering.references.version", lambda name: "0.0.1", 12),
+        ("scene2spad.bench.rendering.references.installed_version", lambda name: "0.0.1", 12),
         ("scenes.library.sets.SceneSet.inputs_sha256", lambda self, view: {"a.png": "other"}, 16),
     ):
         monkeypatch.setattr(place, value)
