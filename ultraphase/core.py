@@ -306,10 +306,11 @@ def require_loadable(program: Program, tables: Mapping[str, np.ndarray] | None, 
 
 def require_progress(program: Program, word: int, patience: int, words: int, cores: int, photons: int) -> None:
     """Raise InputError where `patience` is 0, or more words left the cores than a frame of so many photons has."""
-    require(patience > 0, f"{program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
-    most = MAX_WORDS * cores + WORDS_PER_PHOTON * photons
-    message = f"the frame does not end: more than {MAX_WORDS} words a core, and {WORDS_PER_PHOTON} a photon, left cores"
-    require(words <= most, f"{program.where(word)}: {message}")
+    if patience == 0:
+        raise InputError(f"{program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
+    if words > MAX_WORDS * cores + WORDS_PER_PHOTON * photons:
+        limit = f"{MAX_WORDS} words a core, and {WORDS_PER_PHOTON} a photon, left cores"
+        raise InputError(f"{program.where(word)}: the frame does not end: more than {limit}")
 
 
 @lru_cache(maxsize=4096)
