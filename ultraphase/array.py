@@ -15,7 +15,7 @@ from scenes.errors import InputError, require
 from ultraphase.assembly.isa import ALU, BYTE_LIMIT, DIRECTIONS, HALF_LIMITS, REGISTERS, STEPS, Instruction
 from ultraphase.assembly.program import Program, block_ends
 from ultraphase.chip import ChipSpec, array_shape, chosen_chip
-from ultraphase.core import WATCHDOG_STEPS, Core, Counters, region_contents, require_loadable, require_progress
+from ultraphase.core import WATCHDOG_STEPS, Core, Counters, most_words, no_end, region_contents, require_loadable
 from ultraphase.port import core_offsets, port_timestamps
 
 _RUNS, _HALTED, _PARKED, _BLOCKED = range(4)
@@ -136,7 +136,7 @@ class ArrayRun:
         self.visits = np.zeros(len(self.program.instructions), np.int64)
         self.wraps = self.saturations = self.events = self.words = 0
         self.out: list[np.ndarray] = []  # (core, word, bits) of those that left at one instruction
-        self.ram_bytes = self.program.ram_bytes
+        self.ram_bytes, self.most_words = self.program.ram_bytes, most_words(lanes, port.size)
         self.changed = True  # the status of some core
         self.code = [self._kind(one) for one in self.program.instructions]
         self.block_end = block_ends(self.program)
@@ -161,7 +161,8 @@ class ArrayRun:
             self._block(word, slice(None) if index.size == self.status.size else index, index)
             patience = WATCHDOG_STEPS if self.events != events else patience - 1
             events = self.events
-            require_progress(self.program, word, patience, self.words, self.status.size, self.port.size)
+            if patience == 0 or self.words > self.most_words:
+                raise no_end(self.program, word, patience)
         self._explain_waiting()
         return self._result()
 

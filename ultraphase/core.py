@@ -218,8 +218,9 @@ class Core:
                         self.word, self._stopped = stretch.end, True
                         return
                     word = after
-                left = int(progress != (self._read, len(self.out)))
-                require_progress(self.program, word, left, len(self.out), 1, len(self._port))
+                patience, most = int(progress != (self._read, len(self.out))), most_words(1, len(self._port))
+                if not patience or len(self.out) > most:
+                    raise no_end(self.program, word, patience)
         finally:
             for first, stretch in stretches.items():
                 for done in range(first, stretch.end + 1):
@@ -304,13 +305,16 @@ def require_loadable(program: Program, tables: Mapping[str, np.ndarray] | None, 
     require(named, f"{where}: tables of type {type(tables).__name__}, expected contents by name")
 
 
-def require_progress(program: Program, word: int, patience: int, words: int, cores: int, photons: int) -> None:
-    """Raise InputError where `patience` is 0, or more words left the cores than a frame of so many photons has."""
-    if patience == 0:
-        raise InputError(f"{program.where(word)}: no progress in {WATCHDOG_STEPS} branches")
-    if words > MAX_WORDS * cores + WORDS_PER_PHOTON * photons:
-        limit = f"{MAX_WORDS} words a core, and {WORDS_PER_PHOTON} a photon, left cores"
-        raise InputError(f"{program.where(word)}: the frame does not end: more than {limit}")
+def most_words(cores: int, photons: int) -> int:
+    """Return how many words may leave cores in a frame of so many photons."""
+    return MAX_WORDS * cores + WORDS_PER_PHOTON * photons
+
+
+def no_end(program: Program, word: int, patience: int) -> InputError:
+    """Return why a frame is given up at a word: without `patience` for want of progress, else for its many words."""
+    limit = f"{MAX_WORDS} words a core, and {WORDS_PER_PHOTON} a photon, left cores"
+    reason = f"the frame does not end: more than {limit}" if patience else f"no progress in {WATCHDOG_STEPS} branches"
+    return InputError(f"{program.where(word)}: {reason}")
 
 
 @lru_cache(maxsize=4096)
