@@ -13,13 +13,13 @@ TEXTURE = Texture(np.kron(THERE, np.ones((100, 100))), "holes")
 
 
 def painted(material: Material) -> Surface:
-    """A square lamp of 2 m, before z = 0, with its holes by opacity."""
+    """Make a square lamp of 2 m, before z = 0, with its holes by opacity."""
     vertices, faces, uv = rectangle()
     return Surface(vertices, faces, material, uv=uv, emission=2.0)
 
 
 def cut() -> Surface:
-    """The same with its holes in its mesh."""
+    """Make the same with its holes in its mesh."""
     vertices, faces, _ = rectangle()
     squares = [(vertices + (2 * column - 2, 2 - 2 * row, 0)) / 3 for row, column in np.argwhere(THERE)]
     corners = np.concatenate([faces + 4 * number for number in range(len(squares))])
@@ -34,7 +34,7 @@ def room(lamp: Surface, things: tuple[Surface, ...]) -> Scene:
 
 
 def mirror() -> Surface:
-    """A mirror beside the lamp, which throws its light on the floor."""
+    """Make a mirror beside the lamp, which throws its light on the floor."""
     vertices, faces, _ = rectangle()
     return Surface(vertices[:, [2, 1, 0]] * (1, 1, 0.8) + (1.6, 0, 1.2), faces, Material("conductor"))
 

@@ -18,7 +18,7 @@ def chunk(kind: bytes, content: bytes) -> bytes:
 
 
 def deep_png(levels: np.ndarray) -> bytes:
-    """A PNG of (h, w, channels) levels of 16 bits, every row as differences from the pixel on its left."""
+    """Make a PNG of (h, w, channels) levels of 16 bits, every row as differences from the pixel on its left."""
     height, width, channels = levels.shape
     content = levels.astype(">u2").view(np.uint8).reshape(height, width, 2 * channels)
     rows = np.diff(content, axis=1, prepend=np.uint8(0)).reshape(height, -1)

@@ -149,7 +149,7 @@ def changes(old: Instruction, word: int, registers: list[int], targets: list[int
 
 
 def frames(kind: Kind) -> Iterator[list[list[int]]]:
-    """Timestamps of every core, frame after frame; -1 is a look at the port in vain."""
+    """Yield timestamps of every core, frame after frame; -1 is a look at the port in vain."""
     random, count = np.random.default_rng(2), kind.matrix.shape[1]
     cores = 1 if kind.weights is None else kind.weights.shape[0] * kind.weights.shape[1]
 
@@ -166,7 +166,7 @@ def frames(kind: Kind) -> Iterator[list[list[int]]]:
 
 
 def right(kind: Kind, stamps: list[list[int]]) -> list[list[tuple[int, int]]]:
-    """What leaves each core, and in how many bits: by whole numbers alone."""
+    """Return what leaves each core, and in how many bits: by whole numbers alone."""
     count = kind.matrix.shape[1]
     histograms = np.stack([np.bincount([one for one in row if one >= 0], minlength=count)[:count] for row in stamps])
     sums = histograms @ kind.matrix.T
