@@ -86,7 +86,10 @@ def flow_help(options: type[Common]) -> None:
     """Give the parser the text of every option as one paragraph, of which it would keep the line breaks otherwise."""
     texts: dict[str, str] = {}
     for kind in options.__mro__[-2::-1]:
-        (definition,) = ast.parse(inspect.getsource(kind)).body
+        try:
+            (definition,) = ast.parse(inspect.getsource(kind)).body
+        except OSError:  # installed without its source, of which the texts are a part: there are none to flow
+            return
         assert isinstance(definition, ast.ClassDef)
         for field, text in pairwise(definition.body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):

@@ -307,6 +307,17 @@ def test_the_models_are_a_table_and_each_limit_stands_once(capfd):
         assert len(own) == len(card["not_for"])
 
 
+def test_help_needs_no_source(capsys, monkeypatch):
+    """Installed as compiled files alone, `--help` would end in a traceback."""
+
+    def absent(thing: object) -> str:
+        raise OSError("could not get source code")
+
+    monkeypatch.setattr("scene2spad.options.common.inspect.getsource", absent)
+    assert main(["inspect", "--help"]) == 0
+    assert "--pixel" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_names_what_a_command_takes(name, capsys):
     """No argument is called by its type: the texts of the help speak of files, scenes and models."""

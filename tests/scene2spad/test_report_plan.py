@@ -1,4 +1,4 @@
-"""What `report` expects, against what studies write and what was published; and its cells."""
+"""The report expects what studies write and what was published, and its cells say which."""
 
 import re
 from pathlib import Path

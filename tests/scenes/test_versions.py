@@ -1,4 +1,4 @@
-"""What a result says of the versions that made it, where scene2spad is installed and where it runs from its tree."""
+"""A result states the versions that made it, where scene2spad is installed and where it runs from its tree."""
 
 import tomllib
 from importlib.metadata import PackageNotFoundError, version
