@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -56,12 +57,15 @@ def modules_named(path: Path, *, deep: bool = True, types: bool = False) -> set[
     return found & FILES.keys()
 
 
-IMPORTS = {name: modules_named(path) for name, path in FILES.items()}
+@cache
+def imports() -> dict[str, set[str]]:
+    """Read the imports of every file once, and not before a test asks: both processes of the tests import this one."""
+    return {name: modules_named(path) for name, path in FILES.items()}
 
 
 @pytest.mark.parametrize("package", ARROWS)
 def test_arrows_never_point_back(package):
-    for name, imported in IMPORTS.items():
+    for name, imported in imports().items():
         if name.split(".")[0] == package:
             others = {one.split(".")[0] for one in imported} - {package}
             assert others <= ARROWS[package], (name, others - ARROWS[package])
@@ -69,7 +73,7 @@ def test_arrows_never_point_back(package):
 
 @pytest.mark.parametrize("package", ["spad", "csph"])
 def test_spad_and_csph_run_without_a_renderer(package):
-    for name, imported in IMPORTS.items():
+    for name, imported in imports().items():
         if name.split(".")[0] == package:
             used = {one for one in imported if one.split(".")[0] == "render"}
             assert all(one.startswith(WITHOUT_MITSUBA) for one in used), (name, used)
@@ -77,23 +81,23 @@ def test_spad_and_csph_run_without_a_renderer(package):
 
 def test_no_file_imports_itself_by_way_of_others():
     """Imports inside functions count, and those for types but of the lazy names in __init__.py."""
-    imports = {name: modules_named(path, types=path.name != "__init__.py") for name, path in FILES.items()}
+    with_types = {name: modules_named(path, types=path.name != "__init__.py") for name, path in FILES.items()}
     done, on_the_way = set(), []
 
     def visit(name: str) -> None:
         assert name not in on_the_way, " -> ".join([*on_the_way[on_the_way.index(name) :], name])
         if name not in done:
             on_the_way.append(name)
-            for other in sorted(imports[name]):
+            for other in sorted(with_types[name]):
                 visit(other)
             done.add(on_the_way.pop())
 
-    for name in sorted(imports):
+    for name in sorted(with_types):
         visit(name)
 
 
 def test_plain_twins_are_for_tests_and_benches():
-    for name, imported in IMPORTS.items():
+    for name, imported in imports().items():
         if not name.startswith("scene2spad.bench"):
             assert not {one for one in imported if one.endswith(".reference")}, name
 

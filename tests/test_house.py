@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("scenes", "render", "spad", "csph", "ultraphase", "scene2spad")
-FILES = {path: ast.parse(path.read_text(encoding="utf-8")) for one in PACKAGES for path in (ROOT / one).rglob("*.py")}
+FILES = [path for one in PACKAGES for path in (ROOT / one).rglob("*.py")]
 MAX_LINES, MAX_FUNCTION_LINES, MAX_PARAMETERS, MAX_MODULES = 400, 60, 7, 14
 # What is larger still, at its size: it may shrink, not grow, and nothing may join it.
 LARGER: dict[str, int] = {}
@@ -41,13 +42,19 @@ NO_IMPERATIVE = re.compile(
 )
 
 
+@cache
+def parsed() -> dict[Path, ast.Module]:
+    """Parse every file once, and not before a test asks: both processes of the tests import this one."""
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+
+
 def of(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
 def functions() -> list[tuple[str, ast.FunctionDef]]:
     found = []
-    for path, tree in FILES.items():
+    for path, tree in parsed().items():
         found += [(f"{of(path)} {n.name}", n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
     return found
 
@@ -97,7 +104,7 @@ def test_any_in_signatures():
 
 def test_names_are_the_fields():
     bad = []
-    for path, tree in FILES.items():
+    for path, tree in parsed().items():
         for node in ast.walk(tree):
             name = getattr(node, "id", None) or getattr(node, "attr", None) or getattr(node, "arg", None)
             if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
@@ -120,7 +127,7 @@ def public_functions(body: list[ast.stmt]) -> list[ast.FunctionDef]:
 def test_docstrings_begin_with_an_imperative():
     """Of public functions; properties are nouns."""
     bad = []
-    for path, tree in FILES.items():
+    for path, tree in parsed().items():
         for node in public_functions(tree.body):
             text = ast.get_docstring(node)
             if text is None or any("property" in ast.unparse(one) for one in node.decorator_list):
@@ -160,7 +167,7 @@ def test_random_streams_have_numbers_of_their_own():
 
     twice = {name for name, member in Stream.__members__.items() if member.name != name}
     assert twice == {"VIEW", "ZONES", "COUPLED"}
-    stages = [node for tree in FILES.values() for node in ast.walk(tree) if isinstance(node, ast.Name)]
+    stages = [node for tree in parsed().values() for node in ast.walk(tree) if isinstance(node, ast.Name)]
     assert not [node.id for node in stages if node.id.startswith("STAGE_")]
 
 
@@ -203,7 +210,7 @@ def import_cycle(graph: dict[str, set[str]]) -> list[str]:
 
 def test_folders_import_each_other_in_one_direction():
     graph = imports_between_folders(
-        {of(path).removesuffix(".py").replace("/", "."): tree for path, tree in FILES.items()}
+        {of(path).removesuffix(".py").replace("/", "."): tree for path, tree in parsed().items()}
     )
     assert len(graph) > 30 and "scenes" in graph["render"]
     assert not import_cycle(graph)
