@@ -78,7 +78,7 @@ def check_resealed(reader: str, count: int, folder: Path) -> None:
 
 @pytest.mark.parametrize("reader", ["histogram", "pack"])
 def test_damage_behind_a_checksum_that_fits_is_refused(reader: str, tmp_path: Path) -> None:
-    check_resealed(reader, 16, tmp_path)
+    check_resealed(reader, 8, tmp_path)
 
 
 @pytest.mark.slow

@@ -85,7 +85,8 @@ def test_a_layer_gives_shapes_on_the_meta_device(design):
     assert layer.decode(codes.to("meta")).shape == x.shape
 
 
-@pytest.mark.parametrize("columns", [8, 6])  # pixels of a row are moved 2 and 4 at a time, where not compiled
+# pixels of a row are moved 2 and 4 at a time, where not compiled
+@pytest.mark.parametrize("columns", [8, pytest.param(6, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("design", "switches"), CASES)
 def test_a_compiled_layer_computes_the_same(design, columns, switches):
     layer, x = CompressiveLayer.of(design, **switches).double(), counts(columns)

@@ -104,7 +104,7 @@ def check_both_ways(scene: Scene, off: Callable[[], None], most_noise: float) ->
     return both, alone
 
 
-@pytest.mark.parametrize("smooth", [False, True], ids=["facets", "smooth"])
+@pytest.mark.parametrize("smooth", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["facets", "smooth"])
 @pytest.mark.parametrize("laser", ["flash", *(pytest.param(one, marks=pytest.mark.slow) for one in [*LASERS][1:])])
 @pytest.mark.parametrize("material", [METAL, GLOSS], ids=["metal", "gloss"])
 def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, mis_weight_sampled):
@@ -112,7 +112,7 @@ def test_both_ways_together_are_as_bright_as_one(material, laser, smooth, mis_we
     check_both_ways(scene, mis_weight_sampled, 0.1)
 
 
-@pytest.mark.parametrize("laser", ["flash", "aside"])
+@pytest.mark.parametrize("laser", [pytest.param("flash", marks=pytest.mark.slow), "aside"])
 @pytest.mark.parametrize("kind", ["thindielectric", "dielectric"])
 def test_both_ways_together_are_as_bright_as_one_behind_glass(kind, laser, mis_weight_sampled):
     """A pane, or a slab, before half of the view and what the metal shines on; a displaced laser allows a thin one."""
@@ -201,7 +201,7 @@ def test_polished_things_behind_the_camera(cone_deg, mis_weight_sampled):
     assert both.std(axis=0, ddof=1).sum() < alone.std(axis=0, ddof=1).sum()
 
 
-@pytest.mark.parametrize("laser", ["lamp", "aside"])
+@pytest.mark.parametrize("laser", [pytest.param("lamp", marks=pytest.mark.slow), "aside"])
 def test_an_image_of_few_pixels_gives_the_same_light(laser, mis_weight_sampled, monkeypatch):
     """A telephoto camera has many times more pixels in what a wide laser lights; here are 9, or 3, in each of these."""
     monkeypatch.setattr(render.indirect.glossy, "MAX_IMAGE", 400)

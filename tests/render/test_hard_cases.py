@@ -16,7 +16,11 @@ from scenes.library.hard_cases import SCENES
 
 # Twice what float32 counts to, and the half of what `bench hard-cases` takes: limits follow from the number of paths.
 FEWER = {"one-pixel-2^26": (1 << 25, 2)}
-PARAMETERS = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] * case.slow) for case in CASES.values()]
+LONG = ("groove-60", "caustic")
+PARAMETERS = [
+    pytest.param(case, id=case.name, marks=[pytest.mark.slow] * (case.slow or case.name in LONG))
+    for case in CASES.values()
+]
 
 
 @pytest.mark.parametrize("case", PARAMETERS)

@@ -39,7 +39,11 @@ def indirect(scene: Scene, spp: int = 256) -> float:
     return float(rendered.radiance[rendered.bounces > 1].sum(dtype=np.float64))
 
 
-@pytest.fixture(scope="module", params=[Laser(), Laser(cone_deg=360)], ids=["flash", "lamp"])
+@pytest.fixture(
+    scope="module",
+    params=[Laser(), pytest.param(Laser(cone_deg=360), marks=pytest.mark.slow)],
+    ids=["flash", "lamp"],
+)
 def lit(request: pytest.FixtureRequest) -> tuple[Laser, float]:
     """A laser, and the corridor's indirect light without anything aside."""
     return request.param, indirect(corridor(laser=request.param), spp=32)

@@ -171,6 +171,7 @@ def test_a_target_is_met_by_more_paths():
     assert any("on top" in reason for reason in transient.meta["plan"]["reasons"])
 
 
+@pytest.mark.slow
 def test_one_pixel_nothing_in_view_and_glass():
     assert "filter: biased" in render(room(2), RenderSettings(spp=1, filter=True)).meta["plan"]["reasons"][-2]
     assert "filter" not in render(room(2), RenderSettings(bounces=1, filter=True)).meta["plan"]["reasons"][-2]

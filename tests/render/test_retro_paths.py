@@ -116,7 +116,7 @@ def test_shares_of_three_ways_are_one_together() -> None:
         assert np.allclose(sum(share.numpy()[kept] for share in shares), 1, rtol=1e-5)
 
 
-@pytest.mark.parametrize("laser", LASERS)
+@pytest.mark.parametrize("laser", [pytest.param("flash", marks=pytest.mark.slow), "aside"])
 def test_light_over_the_same_metal_twice_is_as_bright_and_more_even(
     laser: str, under_flash: np.ndarray, without_retro_paths
 ) -> None:

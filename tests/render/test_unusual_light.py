@@ -47,7 +47,9 @@ def in_a_mirror() -> Scene:
     return Scene("mirror", (room(), mirror), looking((0, 0, 0), (0, 0, 1), 40), Laser("flood", cone_deg=360))
 
 
-@pytest.mark.parametrize("scene", [behind_a_panel(), in_a_mirror()], ids=["panel", "mirror"])
+@pytest.mark.parametrize(
+    "scene", [behind_a_panel(), pytest.param(in_a_mirror(), marks=pytest.mark.slow)], ids=["panel", "mirror"]
+)
 def test_indirect_light_is_there_where_no_pixel_is_lit_directly(scene):
     """Against plain path tracing. Pixels of a block share their paths: a sum's error is up to 4 times the pixels'."""
     settings, world = RenderSettings(bounces=3, spp=64), TracedScene(scene)

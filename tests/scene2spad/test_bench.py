@@ -326,6 +326,7 @@ def test_mistakes_end_in_one_line(capfd, tmp_path, argv, message):
     assert status == 2 and message in err and "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_a_megapixel_is_timed_of_the_programs_that_are_asked_for(tmp_path, monkeypatch):
     timed = []
     monkeypatch.setattr("scene2spad.bench.emulate.time_megapixel", lambda chosen, *_: timed.append(chosen.name) or {})

@@ -35,6 +35,7 @@ def calibrated(tmp_path_factory):
     return folder / "mine.toml"
 
 
+@pytest.mark.slow
 def test_a_calibrated_sensor_predicts_a_held_out_capture(calibrated):
     """Shape and amplitude of all zones at 0.3 m, with room over what the full calibration reaches."""
     found = read_sensor(calibrated)
@@ -49,6 +50,7 @@ def test_a_calibrated_sensor_predicts_a_held_out_capture(calibrated):
     assert read_sensor(write_sensor(found, again)) == found
 
 
+@pytest.mark.slow
 def test_sense_takes_the_calibrated_sensor(calibrated, capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     zones = load_sensor(str(calibrated)).zones
@@ -88,6 +90,7 @@ def test_parameters_that_the_captures_do_not_know_are_warned_of(caplog):
     assert record.message == "standard error larger than the value, so that it is not known: trials of 8 zones"
 
 
+@pytest.mark.slow
 def test_files_that_calibrate_did_not_write_are_kept(calibrated, tmp_path, monkeypatch, capfd):
     """A folder, another program's file, a sensor of one's own with its comments: refused before any work."""
 
@@ -140,7 +143,7 @@ def test_distances_of_other_captures_are_refused_before_any_work(distances, word
     assert f"scene2spad: mine.npz: {words}" in err and not [*tmp_path.glob("*.toml")]
 
 
-@pytest.mark.parametrize("effects", [["delay", "background"], []])
+@pytest.mark.parametrize("effects", [["delay", "background"], pytest.param([], marks=pytest.mark.slow)])
 def test_captures_in_part_of_another_order_lead_to_no_file(effects, capfd, tmp_path, monkeypatch):
     """Refuse 6 of 45 captures that are others': returns still move with distance, so that the fit shows it, without
     numbers that overflow."""

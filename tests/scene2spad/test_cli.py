@@ -222,10 +222,13 @@ def test_json_holds_no_nan(capfd, folder):
     assert status == 0 and "NaN" not in out and json.loads(out)["mae_mm"] is None
 
 
-def test_tiny_and_partly_empty_images_are_drawn(capfd, folder):
-    for scene, width, height in (("sphere", 2, 2), ("plane", 1, 1), ("sphere", 5, 3)):
-        status, _, err = run(capfd, "demo", "--scene", scene, "--width", str(width), "--height", str(height))
-        assert status == 0, err
+@pytest.mark.parametrize(
+    ("scene", "width", "height"),
+    [("plane", 1, 1), *(pytest.param("sphere", *size, marks=pytest.mark.slow) for size in ((2, 2), (5, 3)))],
+)
+def test_tiny_and_partly_empty_images_are_drawn(scene, width, height, capfd, folder):
+    status, _, err = run(capfd, "demo", "--scene", scene, "--width", str(width), "--height", str(height))
+    assert status == 0, err
 
 
 def test_nothing_in_view_is_refused(capfd, folder):

@@ -95,6 +95,7 @@ def test_smoke_is_one_view_at_coarse_qualities(capfd, tmp_path):
     assert last[:3] == ["4", "128", "0"] and last[4] == "-" and "nan" not in "".join(last)
 
 
+@pytest.mark.slow
 def test_renders_of_other_code_or_other_files_are_made_again(capfd, tmp_path, monkeypatch):
     """The cache took renders of older tolerances and versions for its own, and those of files that had changed."""
     monkeypatch.setattr(render_error, "SMOKE_QUALITIES", ((1, 4),))

@@ -360,6 +360,7 @@ def test_figures_of_levels_and_depths_count_scenes_and_every_pixel(capfd, tmp_pa
     assert counted == {1: 48, 3: 16}
 
 
+@pytest.mark.slow
 def test_bench_network(capfd, tmp_path, monkeypatch):
     """At a small size: the plain layers give what ours give, and training takes a step even when its time is up."""
     small = {"PRESET": "smoke", "FRAME": (1, 1, 1024, 8, 8), "SCENES": 10, "VIEW_PIXELS": 16, "QUICK_SECONDS": 0.0}
