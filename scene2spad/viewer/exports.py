@@ -12,7 +12,7 @@ from scene2spad.viewer.sources import depth_layer
 from scenes.errors import InputError, require
 from scenes.io.hdf5 import open_checked
 from scenes.io.inputs import read_bytes
-from scenes.io.mesh_formats.ply import plain_ply
+from scenes.io.mesh_formats.ply import read_ply
 from spad.formats.dense import AXES
 from spad.formats.dense_reader import read_dense_arrays
 
@@ -105,7 +105,7 @@ def cloud_content(path: Path) -> Content:
     known = HEADER in _columns(content)
     require(known, f"{path}: no point cloud that `export` wrote (x y z intensity confidence); render a mesh")
     try:
-        plain_ply(content)
+        read_ply(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     rows = np.frombuffer(content.partition(b"end_header\n")[2], np.dtype(COLUMNS))

@@ -254,13 +254,6 @@ def test_comments_of_a_ply_are_in_any_encoding(tmp_path: Path) -> None:
     assert only(load_mesh(written(tmp_path / "a.ply", text), placing=AS_FILE)).faces.shape == (1, 3)
 
 
-def test_strips_of_a_ply_are_named(tmp_path: Path) -> None:
-    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {name}\n" for name in "xyz")
-    text = f"{head}element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
-    message = refusal(written(tmp_path / "a.ply", f"{text}0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"))
-    assert message.endswith("a.ply: holds triangle strips (tristrips), which are not read; export it with faces")
-
-
 @pytest.mark.parametrize(
     ("kind", "values", "levels"),
     [

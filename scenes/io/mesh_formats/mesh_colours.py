@@ -12,7 +12,7 @@ import numpy as np
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_bytes
 from scenes.io.mesh_formats.glb import base_colours
-from scenes.io.mesh_formats.mesh_files import ply_texture, read_material_library
+from scenes.io.mesh_formats.mesh_files import read_material_library
 from scenes.io.mesh_formats.mtl import MaterialEntry
 from scenes.io.textures import (
     MAX_PIXELS,
@@ -44,10 +44,11 @@ class Part:
     faces: np.ndarray
     uv: np.ndarray | None
     normals: np.ndarray | None
-    visual: Visuals
+    visual: Visuals | None
     colours: np.ndarray | None = None  # of a PLY, or beside the material of a GLB
     coloured: str = "vertex"  # what has them
     as_read: tuple[np.ndarray, np.ndarray] | None = None  # vertices and faces before any was dropped, as colours count
+    image: Path | None = None  # of a PLY
 
 
 class Paint:
@@ -109,9 +110,9 @@ class Paint:
         return None if entry.colour is None else float(luminance(np.array(entry.colour)))
 
     def _ply_albedo(self, part: Part) -> Albedo | float | None:
-        file = ply_texture(self.path)
-        if file is not None and self._is_mapped(part):
-            return file, lambda: _file_albedo(file)
+        image = part.image
+        if image is not None and self._is_mapped(part):
+            return image, lambda: _file_albedo(image)
         mean = self._mean_colour(part)
         return None if mean is None else float(luminance(mean))
 

@@ -19,7 +19,6 @@ from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb import check_glb, plain_glb
 from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library, without_mark
 from scenes.io.mesh_formats.obj import alike_obj, obj_fault, plain_obj
-from scenes.io.mesh_formats.ply import plain_ply
 from scenes.io.mesh_formats.polygons import without_dents
 from scenes.io.mesh_formats.stl import check_stl
 
@@ -61,7 +60,7 @@ class _Beside:
 def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
     """Return the trimesh.Scene of a file as it is: nothing merged, removed or reordered.
 
-    kind     ".obj", ".ply", ".stl" or ".glb"
+    kind     ".obj", ".stl" or ".glb"
     options  handed to trimesh
 
     Raises InputError in one line that begins with the file where it is missing, cut short, not consistent with what it
@@ -105,16 +104,19 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
     return loaded
 
 
-def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | None]:
-    """Check a mesh file; return the content that trimesh is to read, and how many triangles it must find, where the
-    file says so."""
+def check_kind(content: bytes, kind: str) -> None:
+    """Raise InputError for a file that is empty, or holds another kind of mesh than its extension says."""
     require(bool(content.strip()), "the file is empty")
     actual = next((ext for magic, ext in MAGIC.items() if content.startswith(magic)), kind)
     require(actual == kind, f"holds {actual} data, its extension says {kind}; rename it")
+
+
+def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | None]:
+    """Check a mesh file; return the content that trimesh is to read, and how many triangles it must find, where the
+    file says so."""
+    check_kind(content, kind)
     try:
         match kind:
-            case ".ply":
-                content = plain_ply(content)
             case ".stl":
                 return content, check_stl(content)
             case ".glb":
@@ -199,13 +201,3 @@ def _with_one_library(content: bytes, beside: _Beside) -> bytes:
     lines = [line.strip() for name in there for line in without_mark(beside.get(name)).splitlines()]
     beside.made["all.mtl"] = b"\n".join(line for line in lines if line.lower().startswith(b"newmtl"))
     return b"mtllib all.mtl\n" + re.sub(rb"^mtllib.*", b"", content, flags=re.MULTILINE)
-
-
-def ply_texture(path: Path) -> Path | None:
-    """Return the image that a PLY's header names; InputError where it is not there, None where it names none."""
-    header = read_bytes(path).partition(b"end_header")[0].decode("utf-8", errors="replace")
-    named = re.search(r"^comment +TextureFile +(.+?)\s*$", header, re.IGNORECASE | re.MULTILINE)
-    try:
-        return None if named is None else file_inside(path.parent, named[1], "texture")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None

@@ -14,19 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.arrays import check_faces
-from scenes.errors import InputError
+from scenes.errors import InputError, require
 from scenes.geometry import shapes
-from scenes.io.inputs import read_bytes
+from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_formats.glb import glb_notes
 from scenes.io.mesh_formats.mesh_colours import Paint, Part
-from scenes.io.mesh_formats.mesh_files import (
-    MAX_COORDINATE,
-    check_vertices,
-    load_trimesh,
-)
-from scenes.io.mesh_formats.ply import ply_colours, ply_points, ply_polygons
-from scenes.io.mesh_formats.polygons import cut_dents
-from scenes.json_types import JsonObject
+from scenes.io.mesh_formats.mesh_files import MAX_COORDINATE, check_vertices, load_trimesh
+from scenes.io.mesh_formats.ply_meshes import load_ply
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing
 
@@ -139,21 +133,44 @@ def _read(path: Path) -> list[Part]:
     kind = path.suffix.lower()
     if kind not in EXTENSIONS:
         raise InputError(f"{path}: extension {kind or '(none)'}, expected one of {' '.join(EXTENSIONS)}")
-    # the texture of a PLY is read here: trimesh goes on without one that it cannot read
-    loaded = load_trimesh(path, kind, **({"skip_materials": True} if kind == ".ply" else {}))
+    found: list[Part | None]
+    if kind == ".ply":
+        found = [*_ply_parts(path)]
+    else:
+        found = _trimesh_parts(path, kind)
+        require(bool(found), f"{path}: empty, no mesh in it")
+    parts = [part for part in found if part is not None]
+    require(bool(parts), f"{path}: has no faces (a point cloud or lines only)")
+    return [replace(parts[0], name=path.stem)] if len(parts) == 1 else parts
+
+
+def _ply_parts(path: Path) -> list[Part]:
+    """Return what a PLY holds, one part a texture."""
+    parts = []
+    for number, mesh in enumerate(load_ply(path)):
+        try:
+            image = None if mesh.image is None else file_inside(path.parent, mesh.image, "texture")
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        normals = _filled(mesh.normals, mesh.vertices, mesh.faces)
+        uv = _finite(mesh.uv, len(mesh.vertices))
+        as_read = mesh.vertices, mesh.faces
+        name = f"{path.stem}_{number}"
+        colours, coloured = mesh.colours, mesh.coloured
+        parts.append(Part(name, *as_read, uv, normals, None, colours, coloured, as_read, image))
+    return parts
+
+
+def _trimesh_parts(path: Path, kind: str) -> list[Part | None]:
+    """Return what trimesh reads of a file, moved by its nodes; None for points, lines and meshes without faces."""
+    loaded = load_trimesh(path, kind)
     try:
         meshes = [(*loaded.graph[node], node) for node in loaded.graph.nodes_geometry]
-        found = [_part(loaded.geometry[name], np.asarray(pose), node) for pose, name, node in meshes]
+        return [_part(loaded.geometry[name], np.asarray(pose), node) for pose, name, node in meshes]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # what trimesh works out only when it is asked for
         raise InputError(f"{path}: broken {kind} file ({(str(error).splitlines() or [''])[0][:200]})") from None
-    parts = [part for part in found if part is not None]
-    if not found:
-        raise InputError(f"{path}: empty, no mesh in it")
-    if not parts:
-        raise InputError(f"{path}: has no faces (a point cloud or lines only)")
-    return [replace(parts[0], name=path.stem)] if len(parts) == 1 else parts
 
 
 def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
@@ -164,35 +181,32 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     check_faces(faces, len(vertices), name)
     check_vertices(vertices, name)
-    if "_ply_raw" in mesh.metadata:
-        faces = _without_dents(mesh.metadata["_ply_raw"], vertices, faces)
     _check_pose(pose, name)
-    uv = getattr(mesh.visual, "uv", None)
-    uv = None if uv is None or np.shape(uv) != (len(vertices), 2) or not np.isfinite(uv).all() else np.asarray(uv)
+    uv = _finite(getattr(mesh.visual, "uv", None), len(vertices))
     # trimesh computes normals on demand; only those that it read from the file are in its cache before that.
     normals = np.asarray(mesh.vertex_normals) if "vertex_normals" in mesh._cache else None
-    if normals is not None:
-        normals = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
-        filled = shapes.filled_normals(normals, vertices, faces)
-        normals = shapes.transform_normals(filled, pose) if normals[faces].any() else None
+    normals = _filled(normals, vertices, faces)
+    normals = None if normals is None else shapes.transform_normals(normals, pose)
     if np.linalg.det(pose[:3, :3]) < 0:
         faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
     beside = mesh.visual if "color" in getattr(mesh.visual, "vertex_attributes", {}) else mesh
-    colours, coloured = beside.vertex_attributes.get("color"), "vertex"
-    if "_ply_raw" in mesh.metadata:  # trimesh keeps the last eight bits of a colour alone
-        colours, coloured = ply_colours(mesh.metadata["_ply_raw"])
     vertices = shapes.transform(vertices, pose)
-    return Part(name, vertices, faces, uv, normals, mesh.visual, colours, coloured, (vertices, faces))
+    colours = beside.vertex_attributes.get("color")
+    return Part(name, vertices, faces, uv, normals, mesh.visual, colours, as_read=(vertices, faces))
 
 
-def _without_dents(elements: JsonObject, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the triangles of a PLY with its dented polygons cut otherwise than into a fan; not where trimesh has split
-    vertices."""
-    polygons = ply_polygons(elements)
-    if not polygons or not np.array_equal(ply_points(elements), vertices):
-        return faces
-    cut = cut_dents(vertices, polygons)
-    return faces if cut is None else cut
+def _finite(uv: np.ndarray | None, vertices: int) -> np.ndarray | None:
+    """Return texture coordinates, or None unless there are two finite ones for each vertex."""
+    good = uv is not None and np.shape(uv) == (vertices, 2) and bool(np.isfinite(uv).all())
+    return np.asarray(uv) if good else None
+
+
+def _filled(normals: np.ndarray | None, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """Return normals with those of no direction made from the faces; None where no vertex of a face has one."""
+    if normals is None:
+        return None
+    normals = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
+    return shapes.filled_normals(normals, vertices, faces) if normals[faces].any() else None
 
 
 def _check_pose(pose: np.ndarray, name: str) -> None:

@@ -1,16 +1,16 @@
-"""Check a PLY against its header, and read of it what trimesh reads otherwise."""
+"""Read a PLY, text or binary: the columns that its header declares, among them lists of any lengths."""
 
 from __future__ import annotations
 
 import re
+import struct
 import warnings
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from scenes.errors import InputError, require
-from scenes.io.mesh_formats import NotReadError
-from scenes.json_types import JsonObject
 
 _PLY_TYPES = {
     "char": "i1",
@@ -33,184 +33,226 @@ _PLY_TYPES = {
     "int64": "i8",
     "uint64": "u8",
 }
+_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}  # of struct
+_LETTERS |= {"f2": "e", "f4": "f", "f8": "d"}
+_TEXT_TYPE = "f8"  # as which all numbers of a text are held
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Lists of numbers, one a row: the values of all of them in one array, and the length of each."""
+
+    values: np.ndarray
+    lengths: np.ndarray
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of a PLY: the numbers (rows,) or lists of each property by its name, and the types it declares."""
+
+    rows: int
+    columns: dict[str, np.ndarray | Lists]
+    types: dict[str, np.dtype[Any]]
+
+    def numbers(self, *names: str) -> np.ndarray | None:
+        """Return columns of numbers side by side, (rows, names) in double precision; None where one is not there."""
+        found = [self.columns.get(name) for name in names]
+        whole = [np.asarray(one, np.float64) for one in found if isinstance(one, np.ndarray)]
+        return np.column_stack(whole) if len(whole) == len(names) else None
+
+
+@dataclass(frozen=True)
+class Ply:
+    """What a PLY holds: its elements by name, and the textures that its comments name."""
+
+    elements: dict[str, Element]
+    textures: list[str]
 
 
 class _Property(NamedTuple):
+    name: str
     type: str
     count_type: str | None  # of a list
 
 
-class _Element(NamedTuple):
+class _Declared(NamedTuple):
     name: str
     rows: int
     properties: list[_Property]
 
 
-def plain_ply(content: bytes) -> bytes:
-    """Return a PLY as trimesh reads it: with a header in UTF-8, whatever its comments are in.
+def read_ply(content: bytes) -> Ply:
+    """Return the elements of a PLY. Faces may have any numbers of corners; types and byte order are as declared.
 
     Raises InputError unless it holds as many values as its header says, no more and no fewer, all of them numbers.
     """
-    elements, order, first = _ply_header(content)
-    if any(element.name == "tristrips" and element.rows for element in elements):
-        raise NotReadError("holds triangle strips (tristrips), which are not read; export it with faces")
-    if order is None:
-        _check_ply_text(content[first:], elements)
-    else:
-        start = first
-        for element in elements:
-            start = _end_of_binary(content, start, element, order)
-        require(start == len(content), f"{len(content) - start} bytes more than its header says")
-    header = content[:first]
-    plain = header.decode("utf-8", errors="replace").encode()
-    return content if plain == header else plain + content[first:]
+    declared, order, textures, at = _header(content)
+    elements = {}
+    lines = _text_lines(content[at:], declared) if order is None else []
+    at = 0 if order is None else at
+    for one in declared:
+        if order is None:
+            columns = _text_columns(lines[at : at + one.rows], one)
+            at += one.rows
+        else:
+            columns, at = _columns(content, at, one, order)
+        types = {each.name: np.dtype(each.type) for each in one.properties}
+        elements[one.name] = Element(one.rows, columns, types)
+    require(order is None or at == len(content), f"{len(content) - at} bytes more than its header says")
+    return Ply(elements, textures)
 
 
-def _ply_header(content: bytes) -> tuple[list[_Element], str | None, int]:
-    """Elements, byte order (None: text), and where the data begins."""
-    end = re.search(rb"^[ \t]*end_header[ \t]*\r?\n?", content, re.MULTILINE)
+def _header(content: bytes) -> tuple[list[_Declared], str | None, list[str], int]:
+    """Elements, byte order (None: text), names of textures, and where the data begins."""
+    end = re.search(rb"(?:^|[\r\n])[ \t]*end_header[ \t]*\r?\n?", content)
+    require(content[:3] == b"ply", "does not begin with ply")
     if end is None:
         raise InputError("its header has no end_header")
-    lines = [line.split() for line in content[: end.start()].decode("latin-1").splitlines()]
+    text = re.split(r"\r\n?|\n", content[: end.start()].decode("utf-8", errors="replace"))
+    lines = [line.split() for line in text]
     formats = [line[1] for line in lines if len(line) > 1 and line[0] == "format"]
     orders = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
     message = f"format {' '.join(formats) or '(none)'}, expected {', '.join(orders)}"
     require(len(formats) == 1 and formats[0] in orders, message)
-    elements: list[_Element] = []
+    elements: list[_Declared] = []
     for line in lines:
         match line:
             case ["element", name, count]:
                 require(count.isascii() and count.isdigit() and len(count) < 19, f"{count} elements {name!r}")
-                elements.append(_Element(name, int(count), []))
-            case ["property", "list", count_type, value_type, _] if elements:
+                elements.append(_Declared(name, int(count), []))
+            case ["property", "list", count_type, value_type, name] if elements:
                 known = count_type in _PLY_TYPES and value_type in _PLY_TYPES
                 require(known, f"property of unknown type: {' '.join(line)}")
-                elements[-1].properties.append(_Property(_PLY_TYPES[value_type], _PLY_TYPES[count_type]))
-            case ["property", value_type, _] if elements:
+                elements[-1].properties.append(_Property(name, _PLY_TYPES[value_type], _PLY_TYPES[count_type]))
+            case ["property", value_type, name] if elements:
                 require(value_type in _PLY_TYPES, f"property of unknown type: {' '.join(line)}")
-                elements[-1].properties.append(_Property(_PLY_TYPES[value_type], None))
+                elements[-1].properties.append(_Property(name, _PLY_TYPES[value_type], None))
             case ["element" | "property", *_]:
                 raise InputError(f"header line {' '.join(line)!r} is not understood")
-    return elements, orders[formats[0]], end.end()
+    named = [re.match(r"comment +TextureFile +(.+?)\s*$", line, re.IGNORECASE) for line in text]
+    return elements, orders[formats[0]], [one[1] for one in named if one is not None], end.end()
 
 
-def _check_ply_text(body: bytes, elements: list[_Element]) -> None:
-    """One line an element, each with the numbers that its properties and its lists' lengths ask for."""
+def _text_lines(body: bytes, declared: list[_Declared]) -> list[str]:
+    """Return one line an element: blank ones are passed over."""
     try:
-        lines = body.decode("utf-8").rstrip().splitlines()
+        lines = [line for line in body.decode("utf-8").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise InputError("its data are no text") from None
-    expected = sum(element.rows for element in elements)
+    expected = sum(one.rows for one in declared)
     require(len(lines) == expected, f"cut short or damaged: {len(lines)} lines of data, its header says {expected}")
-    at = 0
-    for element in elements:
-        rows, at = lines[at : at + element.rows], at + element.rows
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of what is no number, and ends there
-            values = np.fromstring(" ".join(rows), sep=" ")
-        end = _end_of_text(values, element)
-        message = f"cut short or damaged: {len(values)} numbers for {element.rows} elements {element.name!r}"
-        require(end == len(values), f"{message}, expected {end}")
+    return lines
 
 
-def _end_of_text(values: np.ndarray, element: _Element) -> int:
-    """Count the numbers of a text element by its properties and the lengths of its lists."""
-    if all(one.count_type is None for one in element.properties):
-        return element.rows * len(element.properties)
-    width, places = _text_row(values, 0, element)
-    end = element.rows * width
-    if end <= len(values):
-        rows = values[:end].reshape(element.rows, width)
-        if all((rows[:, place] == rows[0, place]).all() for place in places):
-            return end
-    end = 0
-    for _ in range(element.rows):
-        end += _text_row(values, end, element)[0]
-    return end
+def _text_columns(lines: list[str], declared: _Declared) -> dict[str, np.ndarray | Lists]:
+    """Return the columns of a text element: its numbers are put into bytes, and read as a binary element of these."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy warns of what is no number, and ends there
+        values = np.fromstring(" ".join(lines), sep=" ")
+    types = [one._replace(type=_TEXT_TYPE, count_type=one.count_type and _TEXT_TYPE) for one in declared.properties]
+    message = f"cut short or damaged: {len(values)} numbers for {declared.rows} elements {declared.name!r}"
+    try:
+        columns, end = _columns(values.tobytes(), 0, declared._replace(properties=types), "=")
+    except InputError:
+        raise InputError(f"{message}, more are expected, or others") from None
+    require(end == values.nbytes, f"{message}, expected {end // values.itemsize}")
+    return columns
 
 
-def _text_row(values: np.ndarray, start: int, element: _Element) -> tuple[int, list[int]]:
-    """Numbers in the row that begins at `start`, and where in it the lengths of lists stand."""
-    width, places = 0, []
-    for one in element.properties:
-        if one.count_type is not None and start + width < len(values):
-            length = values[start + width]
-            require(0 <= length <= len(values) and length == int(length), f"a list of {length:g} values")
-            places.append(width)
-            width += int(length)
-        width += 1
-    return width, places
+def _columns(content: bytes, start: int, declared: _Declared, order: str) -> tuple[dict[str, np.ndarray | Lists], int]:
+    """Return the columns of a binary element, and where it ends."""
+    if declared.rows == 0:
+        return {}, start
+    even = _even_columns(content, start, declared, order)
+    if even is not None:
+        return even
+    starts, end = _row_starts(content, start, declared, order)
+    require(end <= len(content), "cut short: ends within its data")
+    columns: dict[str, np.ndarray | Lists] = {}
+    at = starts
+    for one in declared.properties:
+        kind = np.dtype(order + one.type)
+        if one.count_type is None:
+            columns[one.name] = _at_any_byte(content, kind)[at]
+            at = at + kind.itemsize
+            continue
+        count_kind = np.dtype(order + one.count_type)
+        lengths = _at_any_byte(content, count_kind)[at].astype(np.int64)
+        at = at + count_kind.itemsize
+        inner = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        places = np.repeat(at, lengths) + kind.itemsize * inner
+        columns[one.name] = Lists(_at_any_byte(content, kind)[places], lengths)
+        at = at + kind.itemsize * lengths
+    return columns, end
 
 
-def _end_of_binary(content: bytes, start: int, element: _Element, order: str) -> int:
-    """Find where the rows of a binary element end. InputError for rows that are not all there, or lists of different
-    lengths."""
-    if element.rows == 0:
-        return start
+def _even_columns(
+    content: bytes, start: int, declared: _Declared, order: str
+) -> tuple[dict[str, np.ndarray | Lists], int] | None:
+    """Return columns and end of an element whose rows are as long as its first; None where lists have other lengths."""
     fields: list[tuple[Any, ...]] = []
     size = 0
-    for number, one in enumerate(element.properties):
+    for number, one in enumerate(declared.properties):
         length: tuple[int, ...] = ()
         if one.count_type is not None:
             kind = np.dtype(order + one.count_type)
             first = content[start + size : start + size + kind.itemsize]
             require(len(first) == kind.itemsize, "cut short: ends within its data")
-            length = (int(np.frombuffer(first, kind)[0]),)
-            require(0 <= length[0] <= len(content), f"a list of {length[0]} values")
+            found = np.frombuffer(first, kind)[0]
+            if not 0 <= found <= len(content) or found % 1:
+                return None
+            length = (int(found),)
             fields.append((f"count{number}", kind))
             size += kind.itemsize
         fields.append((f"value{number}", order + one.type, length))
         size += np.dtype(one.type).itemsize * (length[0] if length else 1)
-    end = start + element.rows * size
-    message = f"cut short or damaged: {element.rows} elements {element.name!r} take {end - start} bytes"
-    require(end <= len(content), f"{message}, {len(content) - start} are there")
-    if any(one.count_type for one in element.properties):
-        rows = np.frombuffer(content, np.dtype(fields), element.rows, start)
-        lists = [rows[name] for name, *_ in fields if name.startswith("count")]
-        even = all((counts == counts[0]).all() for counts in lists)
-        require(even, f"elements {element.name!r} have lists of different lengths, which is read from text alone")
-    return end
+    end = start + declared.rows * size
+    lists = [number for number, one in enumerate(declared.properties) if one.count_type is not None]
+    if end > len(content):
+        message = f"cut short or damaged: {declared.rows} elements {declared.name!r} take {end - start} bytes"
+        require(bool(lists), f"{message}, {len(content) - start} are there")
+        return None
+    rows = np.frombuffer(content, np.dtype(fields), declared.rows, start)
+    columns: dict[str, np.ndarray | Lists] = {}
+    for number, one in enumerate(declared.properties):
+        values = rows[f"value{number}"]
+        columns[one.name] = values
+        if number in lists:
+            counts = rows[f"count{number}"]
+            if not (counts == counts[0]).all():
+                return None
+            columns[one.name] = Lists(values.ravel(), counts.astype(np.int64))
+    return columns, end
 
 
-def ply_polygons(elements: JsonObject) -> list[np.ndarray]:
-    """Return the polygons of a PLY, as trimesh read it, by their corners; none where all are triangles."""
-    data = elements.get("face", {}).get("data", {})
-    names = data if isinstance(data, dict) else data.dtype.names or ()
-    for name in ("vertex_index", "vertex_indices"):
-        if name in names:
-            rows = data[name] if isinstance(data, dict) else data[name]["f1"]
-            if np.shape(rows)[1:] == (3,):
-                return []
-            polygons = [np.asarray(row, np.int64) for row in rows if np.ndim(row) == 1 and len(row) > 2]
-            return polygons if any(len(one) > 3 for one in polygons) else []
-    return []
+def _row_starts(content: bytes, start: int, declared: _Declared, order: str) -> tuple[np.ndarray, int]:
+    """Return where each row of an element begins, and where the last one ends: lists say their lengths one by one."""
+    steps = []
+    gap = 0  # bytes of numbers between one list and the next
+    for one in declared.properties:
+        size = np.dtype(one.type).itemsize
+        if one.count_type is None:
+            gap += size
+        else:
+            count = struct.Struct(order + _LETTERS[one.count_type])
+            steps.append((gap, count.unpack_from, count.size, size))
+            gap = 0
+    starts, at = [], start
+    try:
+        for _ in range(declared.rows):
+            starts.append(at)
+            for before, unpack, count_size, size in steps:
+                at += before
+                (length,) = unpack(content, at)
+                if not length >= 0 or length % 1:
+                    raise InputError(f"a list of {length:g} values")
+                at += count_size + size * int(length)
+            at += gap
+    except struct.error:
+        raise InputError("cut short or damaged: ends within its data") from None
+    return np.array(starts), at
 
 
-def ply_points(elements: JsonObject) -> np.ndarray:
-    """Return the vertices (n, 3) of a PLY, as trimesh read it."""
-    data = elements["vertex"]["data"]
-    return np.column_stack([np.asarray(data[axis], np.float64).ravel() for axis in "xyz"])
-
-
-def ply_colours(elements: JsonObject) -> tuple[np.ndarray | None, str]:
-    """Return the colours (n, 3) that a PLY has per vertex, else per face, and which of the two; shares of white.
-
-    elements  as trimesh read them
-
-    Whole numbers are shares of the most that their type holds, of 255 where they have 32 bits and none is larger.
-    Fractions beyond 2 are taken as levels up to 255 too, as some programs write them.
-    """
-    for element in ("vertex", "face"):
-        properties = elements.get(element, {}).get("properties", {})
-        for names in (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue")):
-            if all(name in properties for name in names):
-                columns = [np.asarray(elements[element]["data"][name], np.float64).ravel() for name in names]
-                values = np.column_stack(columns)
-                kind = np.dtype(properties[names[0]])
-                largest = values.max(initial=0.0)
-                if kind.kind == "f":
-                    most = 255 if largest > 2 else 1
-                else:
-                    most = 255 if kind.itemsize >= 4 and largest <= 255 else np.iinfo(kind).max
-                return np.nan_to_num(values / most), element
-    return None, "vertex"
+def _at_any_byte(content: bytes, kind: np.dtype[Any]) -> np.ndarray:
+    """Return the number that begins at each byte, without a copy."""
+    return np.ndarray((max(0, len(content) - kind.itemsize + 1),), kind, content, strides=(1,))

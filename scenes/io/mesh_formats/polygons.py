@@ -38,16 +38,33 @@ def without_dents(content: bytes) -> bytes:
     return b"".join((*parts, content[end:]))
 
 
-def cut_dents(points: np.ndarray, polygons: list[np.ndarray]) -> np.ndarray | None:
-    """Return triangles (m, 3) of polygons, each the indices of its corners among points (n, 3); None where a fan from
-    the first corner of each is right. Polygons that cross themselves, or are too large, stay fans."""
-    ends = np.cumsum([*map(len, polygons)])
-    dented = {*_dented(points, np.concatenate(polygons), ends)}
-    cut = [cut_polygon(points[polygons[number]]) if number in dented else [] for number in range(len(polygons))]
-    if not any(cut):
-        return None
-    fans = [found or [(0, i, i + 1) for i in range(1, len(one) - 1)] for found, one in zip(cut, polygons, strict=True)]
-    return np.concatenate([one[np.reshape(found, (-1, 3))] for found, one in zip(fans, polygons, strict=True)])
+def triangulated(
+    points: np.ndarray, corners: np.ndarray, lengths: np.ndarray, *, fans: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cut polygons into triangles: each is three places (m, 3) in `corners`, and of the polygon of that number (m,).
+
+    points   (n, 3)
+    corners  indices of points of all polygons, one after the other
+    lengths  how many corners each polygon has, 3 or more
+    fans     cut all into fans from their first corner, those with dents, too
+
+    Polygons that cross themselves, or are too large, are fans always.
+    """
+    ends, counts = np.cumsum(lengths), lengths - 2
+    owners = np.repeat(np.arange(len(lengths)), counts)
+    inside = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+    triangles = (ends - lengths)[owners, None] + np.column_stack((0 * inside, inside + 1, inside + 2))
+    cut = {}
+    for number in [] if fans else _dented(points, corners, ends):
+        start = int(ends[number] - lengths[number])
+        cut[number] = start + np.reshape(cut_polygon(points[corners[start : ends[number]]]), (-1, 3)).astype(np.int64)
+    cut = {number: found for number, found in cut.items() if len(found)}
+    if not cut:
+        return triangles, owners
+    kept = ~np.isin(owners, [*cut])
+    owners = np.concatenate((owners[kept], *(np.full(len(found), number) for number, found in cut.items())))
+    order = np.argsort(owners, kind="stable")
+    return np.concatenate((triangles[kept], *cut.values()))[order], owners[order]
 
 
 def _dented(points: np.ndarray, indices: np.ndarray, ends: np.ndarray) -> list[int]:
@@ -55,7 +72,7 @@ def _dented(points: np.ndarray, indices: np.ndarray, ends: np.ndarray) -> list[i
     corners."""
     sizes = np.diff(ends, prepend=0)
     found: list[int] = []
-    for size in np.unique(sizes[sizes <= MAX_CORNERS]):
+    for size in np.unique(sizes[(sizes > 3) & (sizes <= MAX_CORNERS)]):
         numbers = np.flatnonzero(sizes == size)
         spokes = points[indices[ends[numbers, None] + np.arange(-size, 0)]]
         spokes = spokes[:, 1:] - spokes[:, :1]

@@ -12,8 +12,8 @@ import numpy as np
 from scenes.arrays import check_faces
 from scenes.errors import InputError
 from scenes.geometry import shapes
-from scenes.io.inputs import read_bytes
 from scenes.io.mesh_formats.mesh_files import check_vertices, load_trimesh
+from scenes.io.mesh_formats.ply_meshes import load_ply
 from scenes.io.mesh_formats.serialized import read_serialized
 from scenes.io.mitsuba.bsdf import Look, Materials
 from scenes.io.mitsuba.nodes import Document
@@ -157,20 +157,19 @@ def _read(path: Path, kind: str) -> Mesh:
     """All parts of an .obj or .ply file as one mesh; materials in the file are not looked at."""
     import trimesh
 
-    options = {}
     if kind == "ply":
-        # Only uv per face corner need vertices to be split; splitting loses the normals of the file.
-        options["fix_texture"] = b"texcoord" in read_bytes(path).partition(b"end_header")[0]
-    loaded = load_trimesh(path, f".{kind}", skip_materials=True, **options)
-    parts = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if not parts:
+        meshes = [Mesh(one.vertices, one.faces, one.uv, one.normals) for one in load_ply(path, fans=True)]
+    else:
+        loaded = load_trimesh(path, f".{kind}", skip_materials=True)
+        # trimesh keeps the normals of a file in the cache, where its own exporters look for them too; None if absent.
+        meshes = [
+            Mesh(part.vertices, part.faces, getattr(part.visual, "uv", None), part._cache["vertex_normals"])
+            for part in loaded.geometry.values()
+            if isinstance(part, trimesh.Trimesh) and len(part.faces)
+        ]
+    if not meshes:
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    check_vertices(np.concatenate([part.vertices for part in parts]), path.name)
-    # trimesh keeps the normals of a file in the cache, where its own exporters look for them too; None if absent.
-    meshes = [
-        Mesh(part.vertices, part.faces, getattr(part.visual, "uv", None), part._cache["vertex_normals"])
-        for part in parts
-    ]
+    check_vertices(np.concatenate([mesh.vertices for mesh in meshes]), path.name)
     return _joined(meshes)
 
 
