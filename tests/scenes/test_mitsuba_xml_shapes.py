@@ -105,7 +105,7 @@ def test_a_mesh_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     reads = []
     read = trimesh.load_scene
     monkeypatch.setattr(trimesh, "load_scene", lambda *a, **k: reads.append(1) or read(*a, **k))
-    shape = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
+    shape = '<shape type="obj"><string name="filename" value="quad.obj"/></shape>'
     assert len(load(tmp_path, 3 * shape).surfaces) == 3 and len(reads) == 1
 
 

@@ -225,6 +225,9 @@ def test_a_list_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_polygons_of_a_mitsuba_scene_are_fans_as_in_an_obj_of_one(tmp_path: Path) -> None:
     content = ply("binary_little_endian", [vertices(), ("face", ["list uchar int v"], [[one] for one in SIDES])])
     (tmp_path / "a.ply").write_bytes(content)
-    (found,) = load(tmp_path, '<shape type="ply"><string name="filename" value="a.ply"/></shape>').surfaces
+    (found,) = load(
+        tmp_path,
+        '<shape type="ply"><string name="filename" value="a.ply"/><boolean name="face_normals" value="true"/></shape>',
+    ).surfaces
     assert len(found.faces) == sum(len(side) - 2 for side in SIDES)
     assert (found.faces[-4:, 0] == 0).all()

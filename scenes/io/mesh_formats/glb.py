@@ -21,7 +21,7 @@ _GLB_INDICES = (
     *("index", "count", "byteLength", "byteOffset", "byteStride", "children", "nodes"),
 )
 
-_GLB_USHORT, _GLB_FLOAT = 5123, 5126  # component types
+_GLB_BYTE, _GLB_FLOAT = 5121, 5126  # component types: of whole numbers without a sign
 _NEAREST = 9728
 _WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 
@@ -209,8 +209,8 @@ def _check_primitive(header: JsonObject, primitive: JsonObject) -> None:
 
 
 def plain_glb(content: bytes) -> bytes:
-    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, materials named by their numbers, and 16-bit
-    vertex colours with a material.
+    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, materials named by their numbers, and vertex
+    colours of more than 8 bits with a material.
 
     trimesh keeps such colours as they are only beside a material.
     """
@@ -219,7 +219,7 @@ def plain_glb(content: bytes) -> bytes:
     header["materials"] = [{**one, "name": str(number)} for number, one in enumerate(header.get("materials", []))]
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" not in one]
     colours = [(one, one["attributes"].get("COLOR_0")) for one in primitives]
-    wide = [one for one, at in colours if at is not None and header["accessors"][at]["componentType"] == _GLB_USHORT]
+    wide = [one for one, at in colours if at is not None and header["accessors"][at]["componentType"] != _GLB_BYTE]
     if wide:
         header["materials"].append({})
     for one in wide:

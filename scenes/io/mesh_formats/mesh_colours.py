@@ -14,6 +14,7 @@ from scenes.io.inputs import read_bytes
 from scenes.io.mesh_formats.glb import base_colours
 from scenes.io.mesh_formats.mesh_files import read_material_library
 from scenes.io.mesh_formats.mtl import MaterialEntry
+from scenes.io.mesh_formats.obj import has_colours
 from scenes.io.textures import (
     MAX_PIXELS,
     WHITE,
@@ -45,7 +46,7 @@ class Part:
     uv: np.ndarray | None
     normals: np.ndarray | None
     visual: Visuals | None
-    colours: np.ndarray | None = None  # of a PLY, or beside the material of a GLB
+    colours: np.ndarray | None = None  # of a PLY or an STL, or beside the material of a GLB
     coloured: str = "vertex"  # what has them
     as_read: tuple[np.ndarray, np.ndarray] | None = None  # vertices and faces before any was dropped, as colours count
     image: Path | None = None  # of a PLY
@@ -58,6 +59,7 @@ class Paint:
         self.path, self.notes = path, notes
         kind = path.suffix.lower()
         self.library = read_material_library(path, notes) if kind == ".obj" else {}
+        self.has_colours = kind == ".obj" and has_colours(read_bytes(path))  # per vertex
         self.base_colours = base_colours(read_bytes(path)) if kind == ".glb" else {}
         self.made: dict[object, Material] = {}
 
@@ -81,17 +83,23 @@ class Paint:
         found: Albedo | float | None
         if kind == ".ply":
             found = self._ply_albedo(part)
+        elif kind == ".stl":
+            mean = self._mean_colour(part)
+            found = None if mean is None else float(luminance(mean))
         elif source is None:
             found = self._vertex_colour(part)
         elif kind == ".obj":
             found = self._obj_albedo(part, str(source.name))
         else:
             found = self._glb_albedo(part, source)
+        if self.has_colours and (source is not None or found is None):
+            self.notes.append(f"{part.name}: its colours per vertex are left out")
         if isinstance(found, tuple):
             return found
         if found is None:
             found = DEFAULT_ALBEDO
-            self.notes.append(f"{part.name}: no colour in the file, albedo {found:g}")
+            other = "no other" if self.has_colours else "no"
+            self.notes.append(f"{part.name}: {other} colour in the file, albedo {found:g}")
         value = round(min(max(float(found), 0.0), 1.0), 9)
         return value, lambda: value
 

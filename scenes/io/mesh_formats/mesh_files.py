@@ -18,7 +18,7 @@ from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb import check_glb, plain_glb
 from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library, without_mark
-from scenes.io.mesh_formats.obj import alike_obj, obj_fault, plain_obj
+from scenes.io.mesh_formats.obj import alike_obj, obj_fault, plain_colours, plain_obj
 from scenes.io.mesh_formats.polygons import without_dents
 from scenes.io.mesh_formats.stl import check_stl
 
@@ -40,6 +40,7 @@ class _Beside:
     def __init__(self, path: Path) -> None:
         self.folder, self.file_name = path.parent, path.name  # trimesh names geometry by the file
         self.made: dict[str, bytes] = {}  # what is there in place of files
+        self.textured = False  # whether a material library names an image of colours
 
     def get(self, name: str) -> bytes:
         name = name.strip()
@@ -76,7 +77,8 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
             # trimesh parts a mesh where materials change, and normals that are made would have a crease there
             content = re.sub(rb"^usemtl.*", b"", content, flags=re.MULTILINE)
         if kind == ".obj":
-            content = content if options.get("skip_materials") else without_dents(content)  # Mitsuba cuts fans
+            if not options.get("skip_materials"):  # as for Mitsuba, which cuts fans
+                content = without_dents(plain_colours(content, beside.textured))
             content, options["split_groups"] = alike_obj(content)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -199,5 +201,6 @@ def _with_one_library(content: bytes, beside: _Beside) -> bytes:
         return content
     there = [name for name in names if (beside.folder / name.replace("\\", "/")).exists()]
     lines = [line.strip() for name in there for line in without_mark(beside.get(name)).splitlines()]
+    beside.textured = any(line.lower().startswith(b"map_kd") for line in lines)
     beside.made["all.mtl"] = b"\n".join(line for line in lines if line.lower().startswith(b"newmtl"))
     return b"mtllib all.mtl\n" + re.sub(rb"^mtllib.*", b"", content, flags=re.MULTILINE)

@@ -21,6 +21,7 @@ from scenes.io.mesh_formats.glb import glb_notes
 from scenes.io.mesh_formats.mesh_colours import Paint, Part
 from scenes.io.mesh_formats.mesh_files import MAX_COORDINATE, check_vertices, load_trimesh
 from scenes.io.mesh_formats.ply_meshes import load_ply
+from scenes.io.mesh_formats.stl import STL_HEADER, stl_colours
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing
 
@@ -166,15 +167,17 @@ def _trimesh_parts(path: Path, kind: str) -> list[Part | None]:
     loaded = load_trimesh(path, kind)
     try:
         meshes = [(*loaded.graph[node], node) for node in loaded.graph.nodes_geometry]
-        return [_part(loaded.geometry[name], np.asarray(pose), node) for pose, name, node in meshes]
+        header = read_bytes(path)[:STL_HEADER] if kind == ".stl" else b""
+        parts = [_part(loaded.geometry[name], np.asarray(pose), node, header) for pose, name, node in meshes]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except Exception as error:  # what trimesh works out only when it is asked for
         raise InputError(f"{path}: broken {kind} file ({(str(error).splitlines() or [''])[0][:200]})") from None
+    return parts
 
 
-def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
-    """One mesh in world coordinates; None for points, lines and meshes without faces."""
+def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str, header: bytes) -> Part | None:
+    """One mesh in world coordinates; None for points, lines and meshes without faces. `header` of an STL."""
     faces = np.asarray(getattr(mesh, "faces", ()))
     if faces.size == 0:
         return None
@@ -191,8 +194,10 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str) -> Part | None:
         faces = faces[:, ::-1]  # a mirrored mesh would have its faces inside out
     beside = mesh.visual if "color" in getattr(mesh.visual, "vertex_attributes", {}) else mesh
     vertices = shapes.transform(vertices, pose)
-    colours = beside.vertex_attributes.get("color")
-    return Part(name, vertices, faces, uv, normals, mesh.visual, colours, as_read=(vertices, faces))
+    colours, coloured = beside.vertex_attributes.get("color"), "vertex"
+    if "stl" in mesh.face_attributes:
+        colours, coloured = stl_colours(header, mesh.face_attributes["stl"]), "face"
+    return Part(name, vertices, faces, uv, normals, mesh.visual, colours, coloured, as_read=(vertices, faces))
 
 
 def _finite(uv: np.ndarray | None, vertices: int) -> np.ndarray | None:

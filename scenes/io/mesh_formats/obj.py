@@ -51,6 +51,34 @@ def _corner(corner: bytes, counts: list[int], line: int) -> bytes:
     return b"/".join(parts)
 
 
+def has_colours(content: bytes) -> bool:
+    """Return whether the first vertex of an OBJ has a colour behind its place, as those of many programs have."""
+    first = re.search(rb"^v[ \t]+.*", content, re.MULTILINE)
+    return first is not None and len(first[0].split()) >= 7
+
+
+def plain_colours(content: bytes, textured: bool) -> bytes:
+    """Return an OBJ whose colours per vertex trimesh reads rightly: as shares of white, and not beside coordinates.
+
+    textured  whether a material of its libraries has a texture; without one, coordinates are of no use
+
+    Numbers beyond 2 are levels up to 255. trimesh takes them for white, and drops colours beside texture coordinates.
+    """
+    if not has_colours(content):
+        return content
+    vertices = [line.split() for line in re.findall(rb"^v +.*", content, re.MULTILINE)]
+    try:
+        levels = max(max(map(float, words[4:7]), default=0.0) for words in vertices) > 2
+    except ValueError:
+        return content  # is told elsewhere
+    if levels:
+        shares = iter([words[:4] + [b"%.9g" % (float(word) / 255) for word in words[4:7]] for words in vertices])
+        content = re.sub(rb"^v +.*", lambda _: b" ".join(next(shares)), content, flags=re.MULTILINE)
+    if textured:
+        return content
+    return re.sub(rb"^f .*", lambda face: _cut_to((False, True), face[0]), content, flags=re.MULTILINE)
+
+
 def alike_obj(content: bytes) -> tuple[bytes, bool]:
     """Return an OBJ in which all faces of a material are alike, and whether trimesh must keep its groups apart.
 

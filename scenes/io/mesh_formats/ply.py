@@ -146,9 +146,13 @@ def _text_lines(body: bytes, declared: list[_Declared]) -> list[str]:
 
 def _text_columns(lines: list[str], declared: _Declared) -> dict[str, np.ndarray | Lists]:
     """Return the columns of a text element: its numbers are put into bytes, and read as a binary element of these."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # numpy warns of what is no number, and ends there
-        values = np.fromstring(" ".join(lines), sep=" ")
+    try:
+        with warnings.catch_warnings(action="ignore"):  # numpy warns, or raises, at what is no number
+            values = np.fromstring(" ".join(lines), sep=" ")
+    except ValueError:
+        raise InputError(
+            f"cut short or damaged: not all of {declared.rows} elements {declared.name!r} are numbers"
+        ) from None
     types = [one._replace(type=_TEXT_TYPE, count_type=one.count_type and _TEXT_TYPE) for one in declared.properties]
     message = f"cut short or damaged: {len(values)} numbers for {declared.rows} elements {declared.name!r}"
     try:
