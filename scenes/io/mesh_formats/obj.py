@@ -16,13 +16,13 @@ def plain_obj(content: bytes) -> bytes:
 
     Lines end by LF, CR LF or CR.
 
-    trimesh passes over indented lines, takes the first `mtllib` of comments too, stumbles over a comment behind a face,
-    counts negative indices from the end of the file instead of from their line, and takes vertex 0 for vertex 1. Raises
-    InputError for an index of 0, or before the first.
+    trimesh passes over indented lines, takes `mtllib` and `usemtl` of comments too, stumbles over a comment behind a
+    face, counts negative indices from the end of the file instead of from their line, and takes vertex 0 for vertex 1.
+    Raises InputError for an index of 0, or before the first.
     """
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ").replace(b"\t", b" ")
-    if content[:1] in b" #" or b"\n " in content or re.search(rb"\n#.*mtllib", content):
-        content = re.sub(rb"^ +|^#.*mtllib.*", b"", content, flags=re.MULTILINE)
+    if content[:1] in b" #" or b"\n " in content or re.search(rb"\n#.*(?:mtllib|usemtl)", content):
+        content = re.sub(rb"^ *#.*(?:mtllib|usemtl).*|^ +", b"", content, flags=re.MULTILINE)
     if re.search(rb"^[fv].*#", content, re.MULTILINE):
         content = re.sub(rb"^((?:f|v|vt|vn) [^#\n]*)#.*", rb"\1", content, flags=re.MULTILINE)
     if re.search(rb"\nf[^-\n]*[ /]-|\nf.*? 0+(?=[ /\n]|$)", content) is None:
