@@ -164,6 +164,7 @@ def test_a_unit_is_a_whole_word(tmp_path: Path, words: str, metres: float) -> No
         ("v 0,0 0,0 0,0\nf 1 2 3", "line 5: 'v 0,0 0,0 0,0' is not x y z"),
         ("v 0 1\nf 1 2 5", "line 5: 'v 0 1' is not x y z"),
         ("f 1 2 x", "line 5: 'f 1 2 x' is not numbers of vertices"),
+        ("vn 0 0 1\nf 1//1 2//1 3//2", "line 6: a face's index 2, 1 are there"),
     ],
 )
 def test_a_line_of_an_obj_that_cannot_be_read_is_named(tmp_path: Path, lines: str, message: str) -> None:

@@ -94,6 +94,8 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
         if triangles is not None:
             found = sum(len(getattr(mesh, "faces", ())) for mesh in loaded.geometry.values())
             require(found == triangles, f"cut short or damaged: {found} of its {triangles} triangles can be read")
+        if kind == ".obj" and _lacks_normals(loaded, content) and (fault := obj_fault(original)):
+            raise ValueError(fault)
         _check_size(loaded)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -133,6 +135,12 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
     except InputError as error:
         raise InputError(f"broken {kind} file ({error})") from None
     return content, None
+
+
+def _lacks_normals(loaded: trimesh.Scene, content: bytes) -> bool:
+    """Return whether a mesh of an OBJ that has normals has none: trimesh drops them where one index is too large."""
+    meshes = [mesh for mesh in loaded.geometry.values() if len(getattr(mesh, "faces", ()))]
+    return b"\nvn " in content and any("vertex_normals" not in mesh._cache for mesh in meshes)
 
 
 def _check_size(loaded: trimesh.Scene) -> None:

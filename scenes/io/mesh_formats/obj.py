@@ -72,8 +72,8 @@ def plain_colours(content: bytes, textured: bool) -> bytes:
     except ValueError:
         return content  # is told elsewhere
     if levels:
-        shares = iter([words[:4] + [b"%.9g" % (float(word) / 255) for word in words[4:7]] for words in vertices])
-        content = re.sub(rb"^v +.*", lambda _: b" ".join(next(shares)), content, flags=re.MULTILINE)
+        scaled = iter([words[:4] + [b"%.9g" % (float(word) / 255) for word in words[4:7]] for words in vertices])
+        content = re.sub(rb"^v +.*", lambda _: b" ".join(next(scaled)), content, flags=re.MULTILINE)
     if textured:
         return content
     return re.sub(rb"^f .*", lambda face: _cut_to((False, True), face[0]), content, flags=re.MULTILINE)
