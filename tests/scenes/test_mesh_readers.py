@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import struct
@@ -17,17 +16,10 @@ from scenes.io.mesh_formats import mesh_colours
 from scenes.io.mesh_formats.meshes import load_mesh
 from scenes.io.textures import luminance, srgb_to_linear
 from scenes.placing import Placing
+from tests.scenes.glb_files import CORNERS, RAMP, TEXTURED, UV, glb, png, written
 
 AS_FILE = Placing(scale=1, bare=True)
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
-CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], np.float32)
-UV = np.array([(0, 1), (1, 1), (1, 0), (0, 0)], np.float32)
-TEXTURED = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
-
-
-def written(path: Path, content: str | bytes) -> Path:
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return path
 
 
 def only(scene: Scene) -> Surface:
@@ -41,71 +33,6 @@ def refusal(path: Path) -> str:
     message = str(caught.value)
     assert message.startswith(f"{path}: ") and "\n" not in message
     return message
-
-
-def png(values: np.ndarray, mode: str | None = None) -> bytes:
-    picture = io.BytesIO()
-    image = Image.fromarray(values)
-    (image if mode is None else image.convert(mode)).save(picture, "PNG")
-    return picture.getvalue()
-
-
-RAMP = np.arange(0, 256, 4, dtype=np.uint8).reshape(8, 8)
-
-
-def glb(
-    path: Path,
-    attributes: dict[str, np.ndarray],
-    material: dict | None = None,
-    picture: bytes = png(RAMP, "RGB"),
-    extensions: dict | None = None,
-    **primitive: object,
-) -> Path:
-    """Write a square: whole numbers of attributes are normalized; its one image is a grey ramp; `extensions` of its
-    node."""
-    names = {"float32": 5126, "uint16": 5123, "uint8": 5121, "int16": 5122}
-    arrays = [*attributes.values(), np.array([0, 1, 2, 0, 2, 3], np.uint16)]
-    blocks = [*(array.tobytes() for array in arrays), picture]
-    starts = np.cumsum([0, *(len(block) + -len(block) % 4 for block in blocks)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(block)}
-        for start, block in zip(starts, blocks, strict=False)
-    ]
-    accessors = [
-        {
-            "bufferView": i,
-            "componentType": names[array.dtype.name],
-            "count": len(array),
-            "type": "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}",
-            "normalized": array.dtype.kind in "iu" and array.ndim > 1,
-        }
-        for i, array in enumerate(arrays)
-    ]
-    used = {"material": 0} if material is not None else {}
-    one = {
-        "attributes": {name: i for i, name in enumerate(attributes)},
-        "indices": len(arrays) - 1,
-        **used,
-        **primitive,
-    }
-    header = {
-        "asset": {"version": "2.0"},
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "extensions": extensions or {}}],
-        "meshes": [{"primitives": [one]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": starts[-1]}],
-        "images": [{"bufferView": len(blocks) - 1, "mimeType": "image/png"}],
-        "textures": [{"source": 0}],
-        "materials": [] if material is None else [material],
-    }
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    binary = b"".join(block + b"\0" * (-len(block) % 4) for block in blocks)
-    size = 28 + len(text) + len(binary)
-    head = b"glTF" + struct.pack("<IIII", 2, size, len(text), 0x4E4F534A)
-    return written(path, head + text + struct.pack("<II", len(binary), 0x4E4942) + binary)
 
 
 # --- OBJ -------------------------------------------------------------------------------------------------------------
@@ -290,21 +217,53 @@ def test_a_grey_image_of_16_bits_is_read_whole(tmp_path: Path) -> None:
 
 # --- GLB -------------------------------------------------------------------------------------------------------------
 
-_TRANSFORM = {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}}
+
+def transformed(**transform: object) -> dict:
+    """Return a material whose texture has a KHR_texture_transform."""
+    base = {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": transform}}
+    return {"pbrMetallicRoughness": {"baseColorTexture": base}}
+
+
+def second_set(**base: object) -> dict:
+    return {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1, **base}}}
+
+
+@pytest.mark.parametrize(
+    ("attributes", "material"),
+    [
+        ({"TEXCOORD_0": (UV * 65535).astype(np.uint16)}, TEXTURED),
+        ({"TEXCOORD_0": (UV * 255).astype(np.uint8)}, TEXTURED),
+        ({"TEXCOORD_0": UV, "POSITION": (CORNERS * 32767).astype(np.int16)}, TEXTURED),
+        ({"TEXCOORD_0": 3 * UV, "TEXCOORD_1": UV}, second_set()),
+        ({"TEXCOORD_0": 3 * UV, "TEXCOORD_1": UV / 2 - 1}, transformed(scale=[2, 2], offset=[2, 2])),
+        (
+            {"TEXCOORD_0": (UV / (4, 1) + (0.5, 0)).astype(np.float32)},
+            transformed(scale=[4, 1], offset=[-2, 0], texCoord=0),
+        ),
+        ({"TEXCOORD_0": (UV * 128).astype(np.uint8)}, transformed(scale=[255 / 128] * 2, texCoord=0)),
+    ],
+)
+def test_coordinates_of_a_glb_are_those_that_they_stand_for(tmp_path: Path, attributes: dict, material: dict) -> None:
+    """Whole numbers, another set, and a transform of the texture, against the same square as plain floats."""
+    plain = only(load_mesh(glb(tmp_path / "a.glb", {"POSITION": CORNERS, "TEXCOORD_0": UV}, TEXTURED), placing=AS_FILE))
+    path = glb(tmp_path / "b.glb", {"POSITION": CORNERS} | attributes, material)
+    found = only(load_mesh(path, placing=AS_FILE))
+    np.testing.assert_allclose(found.uv, plain.uv, atol=1e-5)
+    np.testing.assert_allclose(found.vertices, plain.vertices, atol=1e-6)
+    assert found.faces.tolist() == plain.faces.tolist()
+    np.testing.assert_array_equal(found.material.albedo.image, plain.material.albedo.image)
+
+
+def test_a_set_of_coordinates_that_is_not_there_is_noted(tmp_path: Path) -> None:
+    path = glb(tmp_path / "a.glb", {"POSITION": CORNERS, "TEXCOORD_0": UV}, second_set())
+    notes = load_mesh(path, placing=AS_FILE).notes
+    assert "a: its texture is left out, it has no texture coordinates" in notes
 
 
 @pytest.mark.parametrize(
     ("attributes", "material", "primitive", "words"),
     [
-        ({"TEXCOORD_0": (UV * 65535).astype(np.uint16)}, TEXTURED, {}, "whole numbers"),
-        ({"POSITION": (CORNERS * 32767).astype(np.int16)}, None, {}, "normalized"),
-        ({"TEXCOORD_0": UV}, {"pbrMetallicRoughness": {"baseColorTexture": _TRANSFORM}}, {}, "KHR_texture_transform"),
-        (
-            {"TEXCOORD_0": UV, "TEXCOORD_1": UV},
-            {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}},
-            {},
-            "TEXCOORD_1",
-        ),
+        ({"TEXCOORD_0": UV}, transformed(rotation=0.5, texCoord=0), {}, "KHR_texture_transform has a rotation"),
         ({}, None, {"mode": 6}, "triangle fan"),
     ],
 )

@@ -12,6 +12,7 @@ from scenes.arrays import finite_number
 from scenes.errors import InputError, listed, require
 from scenes.io.inputs import parse_json
 from scenes.io.mesh_formats import NotReadError
+from scenes.io.mesh_formats.glb_coordinates import plain_coordinates
 from scenes.io.mesh_formats.glb_nodes import plain_nodes
 from scenes.io.textures import WHITE, Colour, check_checksums
 from scenes.json_types import JsonObject
@@ -21,7 +22,7 @@ _GLB_INDICES = (
     *("index", "count", "byteLength", "byteOffset", "byteStride", "children", "nodes"),
 )
 
-_GLB_BYTE, _GLB_FLOAT = 5121, 5126  # component types: of whole numbers without a sign
+_GLB_BYTE = 5121  # component type of whole numbers without a sign
 _NEAREST = 9728
 _WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 
@@ -53,7 +54,8 @@ def check_glb(content: bytes, read: ReadImage) -> None:
         _check_accessors(header, len(content))
         for mesh in header.get("meshes", []):
             for primitive in mesh["primitives"]:
-                _check_primitive(header, primitive)
+                fan = primitive.get("mode", 4) == 6
+                require(not fan, "a mesh is a triangle fan, which is not read; export it as triangles")
         _stated_colours(header)
         for number in sorted(_used_images(header)):
             _check_image(header, number, binary, read)
@@ -189,32 +191,14 @@ def _check_accessors(header: JsonObject, size: int) -> None:
         require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
 
 
-def _check_primitive(header: JsonObject, primitive: JsonObject) -> None:
-    """Raise InputError for shapes and coordinates that trimesh drops, or takes for others."""
-    require(primitive.get("mode", 4) != 6, "a mesh is a triangle fan, which is not read; export it as triangles")
-    attributes, accessors = primitive["attributes"], header.get("accessors", [])
-    whole = "POSITION" in attributes and accessors[attributes["POSITION"]].get("normalized", False)
-    require(not whole, "positions are normalized whole numbers, which are not read; export them as floats")
-    material = header["materials"][primitive["material"]] if "material" in primitive else {}
-    base = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-    if base is None:
-        return
-    moved = base.get("extensions", {}).get("KHR_texture_transform", {})
-    still = [*moved.get("offset", (0, 0)), *moved.get("scale", (1, 1)), moved.get("rotation", 0)] == [0, 0, 1, 1, 0]
-    require(still, "a base colour has a KHR_texture_transform, which is not read; bake it into the coordinates")
-    chosen = moved.get("texCoord", base.get("texCoord", 0))
-    require(chosen == 0, f"a base colour uses TEXCOORD_{chosen}, TEXCOORD_0 alone is read; export it with one set")
-    floats = "TEXCOORD_0" not in attributes or accessors[attributes["TEXCOORD_0"]]["componentType"] == _GLB_FLOAT
-    require(floats, "texture coordinates are whole numbers, which are not read; export them as floats")
-
-
 def plain_glb(content: bytes) -> bytes:
-    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, materials named by their numbers, and vertex
-    colours of more than 8 bits with a material.
+    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, coordinates as in `plain_coordinates`,
+    materials named by their numbers, and vertex colours of more than 8 bits with a material.
 
     trimesh keeps such colours as they are only beside a material.
     """
     header, binary = _glb_chunks(content)
+    made = plain_coordinates(header, binary)
     plain_nodes(header, binary)
     header["materials"] = [{**one, "name": str(number)} for number, one in enumerate(header.get("materials", []))]
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" not in one]
@@ -227,6 +211,9 @@ def plain_glb(content: bytes) -> bytes:
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
     rest = content[20 + struct.unpack_from("<I", content, 12)[0] :]
+    if len(made) > len(binary):
+        made += bytes(-len(made) % 4)
+        rest = struct.pack("<I4s", len(made), b"BIN\0") + made
     return content[:8] + struct.pack("<II4s", 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
 
 

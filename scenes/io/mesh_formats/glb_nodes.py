@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.errors import listed, require
+from scenes.errors import InputError, listed, require
 from scenes.io.mesh_formats import NotReadError
+from scenes.io.mesh_formats.glb_coordinates import FLOAT, accessor_numbers
 from scenes.json_types import JsonObject
 
-_FLOAT = 5126  # component type
 _FLAT = 1e-9  # shortest to longest axis of a unit sphere under a transform, below which a body is squashed flat
 _ALIKE = 1e-5  # relative difference of joints' transforms: inverse bind matrices are in single precision
 
@@ -118,19 +118,17 @@ def _skin(header: JsonObject, binary: bytes, number: int, worlds: dict[int, np.n
 def _matrices(header: JsonObject, binary: bytes, number: int, count: int) -> np.ndarray | None:
     """Read `count` matrices of an accessor; None where they are not plain numbers of the file itself."""
     accessor = header["accessors"][number]
-    if "bufferView" not in accessor or "sparse" in accessor:
-        return None
-    view = header["bufferViews"][accessor["bufferView"]]
-    if view.get("buffer", 0) != 0 or "uri" in header["buffers"][0]:
-        return None
     kind = accessor["componentType"], accessor["type"]
-    message = f"inverse bind matrices are {kind[1]} of component type {kind[0]}, expected MAT4 of {_FLOAT}"
-    require(kind == (_FLOAT, "MAT4"), message)
-    start, step = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), view.get("byteStride", 64)
-    end = start + step * (count - 1) + 64
-    require(count <= accessor["count"] and step >= 64 and end <= len(binary), "inverse bind matrices are cut short")
-    rows = [np.frombuffer(binary, "<f4", 16, start + step * one) for one in range(count)]
-    return np.array(rows, np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
+    require(
+        kind == (FLOAT, "MAT4"),
+        f"inverse bind matrices are {kind[1]} of component type {kind[0]}, expected MAT4 of {FLOAT}",
+    )
+    require(count <= accessor["count"], "inverse bind matrices are cut short")
+    try:
+        rows = accessor_numbers(header, binary, number)
+    except InputError as error:
+        raise InputError(f"inverse bind matrices are cut short ({error})") from None
+    return None if rows is None else rows[:count].reshape(-1, 4, 4).transpose(0, 2, 1)
 
 
 def _lifted(header: JsonObject, node: JsonObject, label: str, world: np.ndarray) -> JsonObject:
