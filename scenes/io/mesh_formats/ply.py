@@ -165,7 +165,7 @@ def _text_columns(lines: list[str], declared: _Declared) -> dict[str, np.ndarray
 
 def _columns(content: bytes, start: int, declared: _Declared, order: str) -> tuple[dict[str, np.ndarray | Lists], int]:
     """Return the columns of a binary element, and where it ends."""
-    if declared.rows == 0:
+    if declared.rows == 0 or not declared.properties:
         return {}, start
     even = _even_columns(content, start, declared, order)
     if even is not None:
