@@ -164,10 +164,11 @@ class Paint:
 
     def _vertex_colour(self, part: Part) -> float | None:
         """Average the colours stored per vertex or face (linear in glTF, sRGB elsewhere); None where there are none."""
-        kind = getattr(part.visual, "kind", None)
-        if kind not in ("vertex", "face"):
+        visual = part.visual
+        kind = getattr(visual, "kind", None)
+        if visual is None or kind not in ("vertex", "face"):
             return None
-        colours = np.asarray(part.visual.vertex_colors if kind == "vertex" else part.visual.face_colors)[:, :3] / 255
+        colours = np.asarray(visual.vertex_colors if kind == "vertex" else visual.face_colors)[:, :3] / 255
         self.notes.append(f"{part.name}: one mean albedo in place of its colours per {kind}")
         bright = luminance(colours if self.path.suffix.lower() == ".glb" else srgb_to_linear(colours))
         return float(np.average(bright, weights=_areas(part, kind, len(colours))))

@@ -166,10 +166,10 @@ def _polygons(ply: Ply) -> _Polygons | None:
 def _indices(element: Element) -> Lists:
     """Return the lists of vertices of faces or strips: of the usual names, or the only lists there are."""
     lists = {name: column for name, column in element.columns.items() if isinstance(column, Lists)}
-    usual = [name for name in ("vertex_indices", "vertex_index") if name in lists]
-    names = usual or [*lists]
-    require(len(names) == 1 or bool(usual), f"its faces have no vertex_indices, but {', '.join(names) or 'no lists'}")
-    found = lists[names[0]]
+    usual: list[str] = [name for name in ("vertex_indices", "vertex_index") if name in lists]
+    named = ", ".join(lists) or "no lists"
+    require(len(lists) == 1 or bool(usual), f"its faces have no vertex_indices, but {named}")
+    found = lists[usual[0] if usual else named]
     whole = found.values.astype(np.int64)
     require(bool((whole == found.values).all()), "a face's vertex is no whole number")
     return Lists(whole, found.lengths)
