@@ -303,14 +303,14 @@ class CompressiveLayer(nn.Module):
             return blocks.encode_separable(counts, self._temporal_part(), spatial)
         return blocks.encode_blocks(counts, self.weights())
 
-    def _core_sums(self, counts: Tensor) -> tuple[Tensor, Tensor]:
+    def core_sums(self, counts: Tensor) -> tuple[Tensor, Tensor]:
         """Return sums of int8 steps that each pixel's core makes, (B, K, T/Mt, R, C) exact, and the value of a step."""
         blocks.check_counts(counts, self.block)
         steps, step = self._temporal_steps()
         return blocks.encode_blocks(counts, steps.view(*steps.shape[:2], 1, 1)), step
 
     def _encode_int8(self, counts: Tensor) -> Tensor:
-        sums, step = self._core_sums(counts)
+        sums, step = self.core_sums(counts)
         # backward as if no sum wrapped: the slope of a wrapped sum has the wrong sign, and would narrow the clipping
         # range, so that still more sums wrap
         held = straight_through(sums * step, wrapped_sums(sums) * step)
@@ -325,7 +325,7 @@ class CompressiveLayer(nn.Module):
         """Return the mean excess () of all cores' sums over 16 bits, in units of half that range, of counts
         (B, 1, T, R, C) with `int8`; its gradient widens the clipping range."""
         with blocks.in_full(counts):
-            sums, _ = self._core_sums(counts)
+            sums, _ = self.core_sums(counts)
             return (sums.abs() / HALF_RANGE - 1).relu().mean()
 
     def encode_timestamps(self, timestamps: Tensor, offsets: Tensor, size: tuple[int, int, int]) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from csph.codes.blocks import check_counts, encode_blocks
 from csph.codes.design import OWN
-from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8
+from csph.codes.quantise import INT8_RULES, Int8Rule, encode_int16, published_int8, wrapped_sums
 from csph.codes.tensor import CodingTensor
 from csph.layer import CompressiveLayer
 from csph.networks.blockwise import Blockwise, mixers_for
@@ -35,7 +35,7 @@ class Estimate(NamedTuple):
 
     depth_m      (H, W) float32 [m]
     confidence   (H, W) float32: share of the posterior within 3 bins of the answer; 0 where the network sees no photon
-    overflows    16-bit sums that wrapped
+    overflows    16-bit sums that wrapped: of codes in 8 bits, and of a layer that was trained with `int8`
     """
 
     depth_m: np.ndarray
@@ -236,6 +236,7 @@ class DepthModel(nn.Module):
         self.check_histogram(histogram)
         rows, columns, bins = histogram.counts.shape
         tile = tile or (TILE if rows * columns > WHOLE_PIXELS else None)
+        circular = self.config.network == "periodic"
         depth, sure, overflows = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32), 0
         for down, across in self._tiles(rows, columns, tile):
             part = histogram.counts
@@ -248,11 +249,12 @@ class DepthModel(nn.Module):
             if int8:
                 logits, wrapped = self._logits_int8(counts, inside, int8_rule)
             else:
-                logits, wrapped = self(counts.to(next(self.parameters()).device).float()), 0
+                counts = counts.to(next(self.parameters()).device).float()
+                logits, wrapped = self(counts), self._trained_overflows(counts, inside)
             overflows += wrapped
             logits = logits[..., inside[0], inside[1]]
             place = decoded(logits, decoder or self.config.decoder)
-            sure[down.own, across.own] = confidence(logits, place)[0].cpu()
+            sure[down.own, across.own] = confidence(logits, place, circular=circular)[0].cpu()
             depth[down.own, across.own] = (self._on_grid(place) * self.config.sensor.bin_depth_m)[0].cpu()
         seen = sees_photons(histogram.counts, self.network.reach, self.config.block)
         return Estimate(radial_depth_of(histogram, depth), sure * seen, overflows)
@@ -268,11 +270,22 @@ class DepthModel(nn.Module):
         tensor = self.layer.quantised()
         codes, _ = encode_int16(counts, tensor)
         logits = self.logits_of_codes(codes.to(self.layer.temporal.device).float() * tensor.scale)
+        return logits, encode_int16(self._whole_blocks(counts, inside), tensor).overflows
+
+    def _whole_blocks(self, counts: Tensor, inside: tuple[slice, slice]) -> Tensor:
+        """Return the counts of the blocks that reach `inside`."""
         rows, columns = (
             slice(one.start, -(-one.stop // side) * side)
             for one, side in zip(inside, self.config.block[1:], strict=True)
         )
-        return logits, encode_int16(counts[..., rows, columns], tensor).overflows
+        return counts[..., rows, columns]
+
+    def _trained_overflows(self, counts: Tensor, inside: tuple[slice, slice]) -> int:
+        """Count sums that wrap in the cores of a layer with `int8`, of the blocks that reach `inside`; 0 of others."""
+        if self.layer is None or not self.layer.options.int8:
+            return 0
+        sums, _ = self.layer.core_sums(self._whole_blocks(counts, inside))
+        return int((wrapped_sums(sums) != sums).sum())
 
     def depth_of(
         self,
@@ -282,7 +295,7 @@ class DepthModel(nn.Module):
         int8_rule: Int8Rule = "calibrated",
         decoder: Decoder | None = None,
     ) -> tuple[np.ndarray, int]:
-        """Return depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped (0 without int8).
+        """Return depth map (H, W) float32 [m] of `estimate`, and how many 16-bit sums wrapped.
 
         Raises InputError as `estimate`.
         """

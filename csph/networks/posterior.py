@@ -30,16 +30,19 @@ def posterior_median(logits: Tensor) -> Tensor:
     return (bins + (half - lower) / (upper - lower)).squeeze(1)
 
 
-def confidence(logits: Tensor, position: Tensor, within: float = CONFIDENT_BINS) -> Tensor:
+def confidence(logits: Tensor, position: Tensor, within: float = CONFIDENT_BINS, *, circular: bool = False) -> Tensor:
     """Return share of softmax(logits) within `within` bins of a position, (B, T, R, C), (B, R, C) -> (B, R, C) in [0,
     1].
 
-    Positions are in bins from the edge of bin 0; a bin that the interval cuts counts in part. NaN where a logit or the
-    position is NaN.
+    Positions are in bins from the edge of bin 0; a bin that the interval cuts counts in part. On a circle of time what
+    the interval has beyond one end of the range is at the other. NaN where a logit or the position is NaN.
     """
     cumulative = _cumulative(logits)
-    upper, lower = (_at(cumulative, position + step) for step in (within, -within))
-    return ((upper - lower) / cumulative[:, -1]).clamp(0, 1)
+    whole, bins = cumulative[:, -1], logits.shape[1]
+    inside = _at(cumulative, position + within) - _at(cumulative, position - within)
+    if circular:
+        inside = inside + _at(cumulative, position + within - bins) + whole - _at(cumulative, position - within + bins)
+    return (inside / whole).clamp(0, 1)
 
 
 def decoded(logits: Tensor, decoder: Decoder) -> Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
+from scenes.progress import Progress
 from spad.detection.saturation import saturated
 from spad.measurements.histogram import Histogram
 from spad.sensor.arrival import wrap_line
@@ -29,13 +30,20 @@ def zone_grid(zones: ZoneArray) -> tuple[int, int, np.ndarray]:
     return rows, columns, np.lexsort((x, y))
 
 
-def with_budget(zones: ZoneArray, transient: Transient, sensor: Sensor, budget: PhotonBudget) -> ZoneArray:
+def with_budget(
+    zones: ZoneArray,
+    transient: Transient,
+    sensor: Sensor,
+    budget: PhotonBudget,
+    *,
+    progress: Progress | None = None,
+) -> ZoneArray:
     """Scale gains and set backgrounds so that their means over the zones are the budget's, before saturation.
 
     Raises InputError where no light reaches a zone.
     """
     returns = zone_returns(transient, zones)
-    signal = zone_signal(returns, sensor, zones).sum(axis=1).mean()
+    signal = zone_signal(returns, sensor, zones, progress=progress).sum(axis=1).mean()
     every = np.mean([gain * seen.light.sum() for gain, seen in zip(zones.gain, returns, strict=True)])
     signal = signal if signal > PULSE_ENDS * every else 0.0
     record = f"the {sensor.bins * sensor.bin_width_s * 1e9:.4g} ns that {sensor.name} records"
@@ -46,7 +54,9 @@ def with_budget(zones: ZoneArray, transient: Transient, sensor: Sensor, budget: 
     return replace(zones, gain=tuple(gain * scale for gain in zones.gain), background=background)
 
 
-def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed: int = 0) -> Histogram:
+def sense_zones(
+    transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed: int = 0, progress: Progress | None = None
+) -> Histogram:
     """Record one exposure of a multi-zone sensor: counts (rows, columns, T) of its zones.
 
     Depth, albedo and `mixed` are the transient's at each zone's centre. Raises InputError as `zone_returns` does, and
@@ -54,7 +64,7 @@ def sense_zones(transient: Transient, sensor: Sensor, zones: ZoneArray, *, seed:
     """
     rows, columns, order = zone_grid(zones)
     returns = zone_returns(transient, zones)
-    binned = zone_signal(returns, sensor, zones)  # once: it takes nearly all of the time
+    binned = zone_signal(returns, sensor, zones, progress=progress)  # once: it takes nearly all of the time
     flux = binned + np.asarray(zones.background)[:, None]
     counts = draw_flux(flux, zones, seed)
     signal, background = binned.sum(axis=1), np.asarray(zones.background) * sensor.bins

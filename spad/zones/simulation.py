@@ -10,6 +10,7 @@ import numpy as np
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import require
+from scenes.progress import Progress
 from scenes.random_streams import Stream
 from spad.detection.saturation import draw_saturated, saturated
 from spad.sensor.clock import chirped
@@ -148,7 +149,14 @@ def stray_returns(returns: ZoneReturns, leak: float, echo_m2: float) -> ZoneRetu
     return ZoneReturns(np.array([0.0, near]), np.array([0.0, far]), np.array([leak, echo]))
 
 
-def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, drift_s: float = 0.0) -> np.ndarray:
+def zone_signal(
+    returns: list[ZoneReturns],
+    sensor: Sensor,
+    zones: ZoneArray,
+    drift_s: float = 0.0,
+    *,
+    progress: Progress | None = None,
+) -> np.ndarray:
     """Return expected primary signal detections (Z, T) float64: pulses integrated over each zone's own bins, crosstalk
     added.
 
@@ -159,6 +167,8 @@ def zone_signal(returns: list[ZoneReturns], sensor: Sensor, zones: ZoneArray, dr
     period_m = SPEED_OF_LIGHT_M_PER_S * sensor.period_s
     own = np.zeros((zones.count, sensor.bins))
     for zone, seen in enumerate(returns):
+        if progress is not None:
+            progress("zones", zone / zones.count)
         scale = 1 / (SPEED_OF_LIGHT_M_PER_S * zones.clock[zone])
         every = zip(seen, stray_returns(seen, zones.leak[zone], zones.echo_m2[zone]), strict=True)
         all_light = since_emission(ZoneReturns(*(np.concatenate(pair) for pair in every)), period_m)

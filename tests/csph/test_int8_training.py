@@ -17,6 +17,8 @@ from csph.networks.model import DepthModel
 from csph.training.loop import DepthTraining, train
 from csph.training.views import split_views
 from scenes import InputError
+from spad.measurements.histogram import Histogram
+from spad.sensor.model import Sensor
 
 LEARNED, FOURIER = Design("learned", (16, 2, 2), 4), Design("fourier", (64, 1, 1), 8)
 
@@ -53,6 +55,20 @@ def test_codes_are_sums_of_int8_steps_that_wrap_at_16_bits(peak):
             total += int(weights[k, r, c]) * int(np.int64((steps[k] * photons).sum()).astype(np.int16))
         expected = total * made.temporal_scale * made.spatial_scale
         assert found[image, k, time, row, column] == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+def test_sums_that_wrap_in_a_layer_trained_for_the_chip_are_counted():
+    """Without `int8=True` as well: its codes are sums of 16 bits in any case. Each wrapped sum counts once in tiles."""
+    sensor = Sensor(name="small", bins=64, bin_width_s=1e-10)
+    model = DepthModel(ModelConfig(design=LEARNED, sensor=sensor, layer={"int8": True}), 1).eval()
+    seen = np.random.default_rng(2).poisson(0.4, (10, 6, 64))
+    seen[3:5, 2, 21] += 700
+    steps = model.codes_layer.quantised().temporal.astype(np.int64)
+    sums = np.einsum("km,rctm->rckt", steps, seen.reshape(10, 6, 4, 16))
+    expected = int((sums != sums.astype(np.int16)).sum())
+    histogram = Histogram.from_counts(seen, sensor)
+    assert model.estimate(histogram).overflows == model.estimate(histogram, tile=4).overflows == expected > 0
+    assert model.depth_of(Histogram.from_counts(np.minimum(seen, 2), sensor))[1] == 0
 
 
 def test_backward_goes_straight_through_the_rounding():

@@ -14,7 +14,9 @@ from csph.networks.compact import Compact
 from csph.networks.config import ModelConfig, TrainConfig
 from csph.networks.model import DepthModel
 from csph.networks.periodic import PERIOD, STEP, CircularInTime, Periodic
+from csph.networks.posterior import confidence
 from scenes.errors import InputError
+from spad.measurements.histogram import Histogram
 from spad.sensor.model import Sensor
 
 BINS = 128
@@ -37,6 +39,24 @@ def test_a_delay_moves_the_answer(code, steps):
     with torch.no_grad():
         moved, logits = model(seen.roll(shift, 2)), model(seen)
     torch.testing.assert_close(moved, logits.roll(shift, 1), rtol=1e-3, atol=1e-3)
+
+
+def test_a_delay_around_the_end_of_the_range_leaves_the_network_as_sure():
+    """Of the same light, 32 bins later, the share of the posterior around its own peak is the same."""
+    model = DepthModel(PERIODIC, 2).eval()
+    early, pulse = np.zeros((8, 8, BINS), np.int32), [3, 9, 3]
+    early[..., BINS - 2 :], early[..., 0] = pulse[:2], pulse[2]
+    later = np.roll(early, PERIOD, 2)
+    with torch.no_grad():
+        logits = [model(torch.from_numpy(one).permute(2, 0, 1)[None, None].float()) for one in (early, later)]
+    at = torch.full((1, 8, 8), BINS - 0.5)
+    sure = [confidence(of, place % BINS, circular=True) for of, place in zip(logits, (at, at + PERIOD), strict=True)]
+    torch.testing.assert_close(sure[0], sure[1], rtol=1e-3, atol=1e-5)
+    found = model.estimate(Histogram.from_counts(early, SMALL))
+    place = torch.from_numpy(found.depth_m / SMALL.bin_depth_m)[None]
+    torch.testing.assert_close(
+        torch.from_numpy(found.confidence)[None], confidence(logits[0], place, circular=True), rtol=1e-3, atol=1e-5
+    )
 
 
 def test_in_training_it_follows_whole_periods():

@@ -71,6 +71,20 @@ def test_median_moves_with_the_posterior_and_passes_nan_on():
     assert posterior_median(logits).isnan().all() and confidence(logits, torch.ones(1, 1, 1)).isnan().all()
 
 
+def test_confidence_on_a_circle_does_not_depend_on_where_the_range_begins():
+    """Rolling time moves position and posterior alike; only on a line do the ends of the range cut the interval."""
+    logits = 3 * torch.randn(1, 20, 2, 3, generator=torch.Generator().manual_seed(1))
+    place = torch.tensor([[[0.0, 1.3, 2.5], [9.9, 16.0, 19.7]]])
+    there = confidence(logits, place, circular=True)
+    for shift in (1, 4, 13):
+        moved = confidence(logits.roll(shift, 1), (place + shift) % 20, circular=True)
+        torch.testing.assert_close(moved, there, rtol=1e-4, atol=1e-6)
+    on_a_line = confidence(logits, place)
+    inside = (place >= 3) & (place <= 17)
+    torch.testing.assert_close(there[inside], on_a_line[inside], rtol=1e-4, atol=1e-6)
+    assert (there[~inside] > on_a_line[~inside]).all()
+
+
 def test_a_flat_background_does_not_draw_the_median_to_mid_range():
     """The mean of 70 % at bin 10 and 30 % everywhere of 1000 lies at bin 157, the median within its bin."""
     posterior = torch.full((1000,), 0.3 / 1000)

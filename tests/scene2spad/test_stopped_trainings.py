@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from render.transient.packs import write_pack
+from scene2spad.cli.results.compare import Compare
+from scene2spad.cli.results.compare import run as run_compare
 from scene2spad.cli.simulation.depth import Depth
 from scene2spad.cli.simulation.depth import run as run_depth
 from scene2spad.datasets.planes import wall
@@ -54,8 +56,9 @@ def test_commands_that_take_a_stopped_run_say_so_until_it_ends(stopped, caplog):
             run_evaluate(EVALUATE, quietly)
             run_train(replace(TRAIN, init="run", out=Path(out), steps=1), quietly)
             run_depth(Depth(file=Path("wall.sensed.h5"), method="network", checkpoint=Path("run"), out=depth), quietly)
+            run_compare(Compare(file=Path("wall.sensed.h5"), methods=("argmax", "fourier-4", "run")), quietly)
         return [line for line in caplog.messages if "come to its end" in line]
 
-    assert told("next") == [WARNING] * 3
+    assert told("next") == [WARNING] * 4
     run_train(TRAIN, quietly)
     assert told("other") == []

@@ -348,6 +348,14 @@ def test_what_zones_lose_and_where_they_look():
     assert "1 of 2 look partly beside the image, by up to 50 %" in sense_zones(view(), SENSOR, aside).meta["plan"][1]
 
 
+def test_every_zone_is_reported_as_progress():
+    told: list[tuple[str, float]] = []
+    sense_zones(view(), SENSOR, TWO, progress=lambda what, fraction: told.append((what, fraction)))
+    assert told == [("zones", 0.0), ("zones", 0.5)]
+    with_budget(TWO, view(), SENSOR, PhotonBudget(1.0, 1.0), progress=lambda what, fraction: told.append((what, 1.0)))
+    assert len(told) == 4
+
+
 def test_zones_tell_how_much_of_their_light_wraps():
     """A plane at 0.3 m in a period of 0.96 m, and one at 1.2 m."""
     sensor = replace(SENSOR, period_s=6.4e-9)

@@ -37,7 +37,8 @@ class Compare(Common):
 
 def run(command: Compare, progress: Progress) -> dict:
     """Run the command: one histogram -> depth by every method, a table and a figure."""
-    from scene2spad.methods import depth_method
+    from scene2spad.methods import depth_method, is_classical
+    from scene2spad.networks.end_warnings import warn_of_unfinished
     from scene2spad.plots.figures import draw_comparison
     from scenes.files import write_csv
     from spad.estimators.depth import histogram_errors
@@ -54,6 +55,9 @@ def run(command: Compare, progress: Progress) -> dict:
     keep_foreign(figure, PNG_FIGURE)
     histogram = open_for_depth(source, command.frame)
     methods = {name: depth_method(name, histogram.sensor, seed=command.seed) for name in command.methods}
+    for name in command.methods:
+        if not is_classical(name):
+            warn_of_unfinished(name)
     rows, depths = [], {}
     for number, (name, method) in enumerate(methods.items()):
         progress(name, number / len(methods))

@@ -128,7 +128,7 @@ def run(command: Sense, progress: Progress) -> dict:
     """Run the command: transient -> histogram, its picture, and the .mat layout where asked."""
     zones = load_sensor(command.sensor).zones
     if zones is not None:
-        return _run_zones(command, zones)
+        return _run_zones(command, zones, progress)
     sensor, optics = sensor_of(command), optics_of(command)
     budget = budget_of(command)
     _refuse(command, PIXELS_OF_A_MAP if command.dark_map is not None else (), "--dark-map")
@@ -150,8 +150,7 @@ def run(command: Sense, progress: Progress) -> dict:
         transient, sensor, budget, seed=command.seed, model=command.model, dark_map_hz=dark_map, progress=progress
     )
     seconds = time.perf_counter() - start
-    for reason in histogram.meta["plan"]:
-        log.log(logging.WARNING if reason.startswith("warning:") else logging.INFO, "%s", reason)
+    _log_plan(histogram)
     write_histogram(histogram, out)
     result = {"seconds": seconds, **summary(histogram), "out": str(out)}
     if command.export == "mat":
@@ -218,7 +217,7 @@ def _refuse(command: Sense, options: Sequence[str], beside: str) -> None:
         require(not given, f"--{option.replace('_', '-')} does not go with {beside}")
 
 
-def _run_zones(command: Sense, zones: ZoneArray) -> dict:
+def _run_zones(command: Sense, zones: ZoneArray, progress: Progress) -> dict:
     """Transient -> histogram of a multi-zone sensor, whose gains are its own unless a budget is asked for."""
     from spad.zones.histogram import sense_zones, with_budget
 
@@ -236,11 +235,10 @@ def _run_zones(command: Sense, zones: ZoneArray) -> dict:
             if calibrated and getattr(command, name) is None:
                 message = "%s: %g photons a zone, the default, and not as calibrated, since --%s is given"
                 log.warning(message, name, DEFAULT_PHOTONS, other)
-        zones = with_budget(zones, transient, sensor, budget_of(command))
-    histogram = sense_zones(transient, sensor, zones, seed=command.seed)
+        zones = with_budget(zones, transient, sensor, budget_of(command), progress=progress)
+    histogram = sense_zones(transient, sensor, zones, seed=command.seed, progress=progress)
     seconds = time.perf_counter() - start
-    for reason in histogram.meta["plan"]:
-        log.info("%s", reason)
+    _log_plan(histogram)
     write_histogram(histogram, out)
     result = {"seconds": seconds, **summary(histogram), "out": str(out)}
     if command.figure:
@@ -248,6 +246,11 @@ def _run_zones(command: Sense, zones: ZoneArray) -> dict:
 
         result["figure"] = str(draw_histogram(histogram, picture(out, "histogram"), expected=None))
     return result
+
+
+def _log_plan(histogram: Histogram) -> None:
+    for reason in histogram.meta["plan"]:
+        log.log(logging.WARNING if reason.startswith("warning:") else logging.INFO, "%s", reason)
 
 
 def summary(histogram: Histogram) -> dict:
