@@ -11,8 +11,9 @@ times, with delays of 0, 8, 16 and 24 bins, and its logits are averaged (`eval`;
 
 The weights are the compact network's.
 
-A return within some bins of the range's ends has its posterior on both. The median is then on one of them, right around
-the circle; the mean (soft-argmax) is somewhere between, metres off.
+A return within some bins of the range's ends has its posterior on both. The median is then on one of them, as
+the part on the other is taken for far away: up to 1.5 bins inwards; the mean (soft-argmax) is somewhere between, metres
+off.
 """
 
 from __future__ import annotations
