@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from render.settings import MIN_ERROR
 from render.transient.samples import Samples, select
 from scenes.constants import (
     REFERENCE_BINS,
@@ -313,7 +314,8 @@ def error_for_budget(reference: np.ndarray, signal: float, background: float) ->
     if total <= 0:
         return 1.0
     scale = signal * len(reference) / total
-    return float(np.clip(0.1 * math.sqrt(len(reference) * (signal + background) / power) / scale, 1e-4, 1.0))
+    error = 0.1 * math.sqrt(len(reference) * (signal + background) / power) / scale
+    return float(np.clip(error, MIN_ERROR, 1.0))
 
 
 def error_of_background(background: float, signal: float) -> float:

@@ -14,6 +14,7 @@ from render.settings import (
     GRIDS,
     MAX_BOUNCES,
     MAX_GRID,
+    MIN_ERROR,
     MIN_SPP,
     WIDEST_GROWTH,
     WIDEST_INDIRECT_M,
@@ -321,13 +322,17 @@ def _indirect(
 
 def _aim(settings: RenderSettings, target: float, paths: float) -> tuple[float, float]:
     """Return the error that direct light and merging are planned for, and the paths a pixel beside them: the target,
-    or what forced paths leave where no target was asked for and that is less. As many own paths as `paths` meet it."""
+    or what forced paths leave where no target was asked for and that is less. As many own paths as `paths` meet it.
+
+    Where the brightest pixels hardly have indirect light the paths would leave next to nothing, and cells would be of no
+    width.
+    """
     if settings.spp is None:
         return target, paths
     left = SHARED_NOISE * target * math.sqrt(paths / settings.spp)
     if settings.error is not None or settings.budget is not None or not 0 < left < target:
         return target, 0.0
-    return left, settings.spp
+    return max(left, MIN_ERROR), settings.spp
 
 
 def bounces_for(energy: np.ndarray, allowed: float, least: int = 1) -> tuple[int, float]:

@@ -17,6 +17,7 @@ MAX_BOUNCES = 63
 # of some 120 bytes each when it is written.
 MIN_PIXEL_BYTES = 170 + 4 * 120
 MAX_SAMPLES = 1 << 26
+MIN_ERROR = 1e-4  # that can be asked for, and that a plan aims at by itself
 # Independent batches of indirect light, whose spread is the error estimate. Low-discrepancy sets run within a batch:
 # fewer batches mean longer sets and less noise.
 BATCHES = 4
@@ -106,7 +107,7 @@ class RenderSettings:
             ("spp", 1, MAX_SAMPLES),
             ("clamp", 1e-3, 1e6),
             ("grid", 1, MAX_GRID),
-            ("error", 1e-4, 1.0),
+            ("error", MIN_ERROR, 1.0),
             ("min_spp", 1, MAX_SAMPLES),
             ("target_fraction", 0.1, 2.0),
             ("direct_fraction", 0.05, 0.95),

@@ -9,12 +9,13 @@ import pytest
 from render.engine import remedy_reasons, render
 from render.error import PULSE_POWER, IndirectErrors, checked_pixels, estimate, power_of, response, target_verdict
 from render.indirect.schedule import Schedule
-from render.planning import PILOT_PIXELS, cell_narrowing
+from render.planning import PILOT_PIXELS, cell_narrowing, make_plan
+from render.scene.traced_scene import TracedScene
 from render.settings import WIDEST_GROWTH, WIDEST_INDIRECT_M, RenderSettings
 from render.transient import Transient
 from render.transient.samples import Samples
 from scene2spad.bench.hard import oracles
-from scenes import Material, Scene, Surface
+from scenes import Camera, Material, Scene, Surface
 from scenes.constants import REFERENCE_BINS
 from scenes.geometry.shapes import box
 
@@ -121,6 +122,23 @@ def test_plans_say_how_wide_cells_are_and_settings_rule():
     asked = RenderSettings(bounces=2, spp=16, grid=2, error=1e-3, indirect_tolerance_m=0.02, indirect_growth=0.0)
     plan = render(scene, asked).meta["plan"]
     assert plan["indirect_tolerance_m"] == 0.02 and plan["indirect_growth"] == 0
+
+
+def just_above_the_floor_of_a_room() -> Scene:
+    """What is seen of the floor is a tenth of a millimetre away, and 10^8 times as bright as the walls."""
+    vertices, faces, uv = box((4, 3, 5))
+    walls = Surface(vertices + [0, 1.5, 0], faces[:, ::-1], Material(albedo=0.6), uv=uv)
+    return Scene("floor", (walls,), Camera.look_at((0, 1e-4, 1), (0, 1e-4, 0), fov_deg=60, width=8, height=8))
+
+
+def test_forced_paths_plan_for_no_smaller_error_than_can_be_asked_for():
+    """Else cells have no width where direct light is all but everything: 20 GB of them, before the render began."""
+    world = TracedScene(just_above_the_floor_of_a_room())
+    forced, asked = (
+        make_plan(world, RenderSettings(bounces=3, **settings), seed=1) for settings in ({"spp": 64}, {"error": 1e-4})
+    )
+    assert forced.indirect_growth == asked.indirect_growth and forced.indirect_tolerance_m == asked.indirect_tolerance_m
+    assert forced.grid <= asked.grid
 
 
 @pytest.mark.parametrize(("total", "words"), [(0.03, ("indirect light: too few paths; ask",)), (0.01, ())])
