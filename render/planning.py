@@ -324,8 +324,7 @@ def _aim(settings: RenderSettings, target: float, paths: float) -> tuple[float, 
     """Return the error that direct light and merging are planned for, and the paths a pixel beside them: the target,
     or what forced paths leave where no target was asked for and that is less. As many own paths as `paths` meet it.
 
-    Where the brightest pixels hardly have indirect light the paths would leave next to nothing, and cells would be of no
-    width.
+    Where direct light is all but everything that would be next to nothing, and cells would have no width.
     """
     if settings.spp is None:
         return target, paths

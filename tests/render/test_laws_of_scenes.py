@@ -1,4 +1,5 @@
-"""Change what no render may depend on: things far away and unlit, place, side, size and triangles of a scene."""
+"""Change what no render may depend on: things far away and unlit, place, side, size and triangles of a scene, and
+which of laser and camera is where."""
 
 from __future__ import annotations
 
@@ -120,3 +121,26 @@ def test_radiance_falls_with_the_square_of_a_scenes_size(lit: tuple[Scene, np.nd
     scene, found = lit
     direct, indirect = sums(scaled(scene, factor))[0] * factor**2
     assert direct == pytest.approx(found[0, 0], rel=2e-3) and indirect == pytest.approx(found[0, 1], rel=SAME_PATHS)
+
+
+@pytest.mark.slow
+def test_laser_and_camera_may_change_places() -> None:
+    """Helmholtz reciprocity: a narrow view of one wall of a groove, and a lamp as narrow on the other one.
+
+    Both look the same way. The view is a square of the disk's area, small enough for that not to matter.
+    """
+    ends, field_deg = (np.array([-0.6, 0.05, 0.7]), np.array([0.5, -0.1, 0.4])), 2.0
+    line = np.array([(-1.6, -0.4), (0, -1.2), (1.5, -0.2)])
+    vertices = np.array([(x, y, z) for x, z in line for y in (-1, 1)], float)
+    faces = np.array([(0, 2, 3), (0, 3, 1), (2, 4, 5), (2, 5, 3)])
+    groove = Surface(vertices, faces, Material(albedo=0.6))
+    light = []
+    for eye, lamp in (ends, ends[::-1]):
+        view = Camera.look_at(eye, eye - [0, 0, 1], fov_deg=field_deg, width=4, height=4)
+        laser = Laser(baseline_m=tuple(view.rotation.T @ (lamp - eye)), cone_deg=field_deg * 2 / np.sqrt(np.pi))
+        scene = Scene("groove", (groove,), view, laser)
+        light.append([render(scene, RenderSettings(bounces=4, spp=512, grid=2), seed=seed) for seed in range(3)])
+    there, back = (np.array([one.total_radiance().sum() for one in ones]) for ones in light)
+    error = np.sqrt((there.var(ddof=1) + back.var(ddof=1)) / 3)
+    assert (light[0][0].bounces > 1).all()
+    assert abs(there.mean() - back.mean()) < 5 * error + 2e-3 * there.mean() and error < 5e-3 * there.mean()
