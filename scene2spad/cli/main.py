@@ -240,6 +240,9 @@ def _unparsed(text: str) -> str:
     implied = {"for int()": ["INT"], "to float": ["FLOAT"]}
     kinds = re.findall(r"\b(?:INT|FLOAT)\b", found[2]) or next((k for w, k in implied.items() if w in found[2]), [])
     given = " ".join(re.findall(r"'(.*?)'", found[2]))
+    several = re.search(rf"Argument helptext: {found[1]} \[(INT|FLOAT) \[", text)
+    if several is not None and given:
+        return f"{found[1]} {given}, expected {'whole ' if several[1] == 'INT' else ''}numbers"
     if not kinds or not given:
         return ""
     what = "whole number" if kinds[0] == "INT" else "number"

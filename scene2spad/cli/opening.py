@@ -221,7 +221,7 @@ def transient_of(histogram: Histogram, path: Path, given: Path | None) -> Transi
     source = given or path.with_suffix(".exr")
     if given is None and not (source.is_file() and holds_kind(source, "transient")):
         return None
-    kind = kind_of(source)
+    kind = kind_of(source if source.is_dir() else input_file(source))
     require(kind == "transient", f"{source}: is of kind {kind}, expected the transient that {path} was sensed from")
     transient = open_transient(source, kind, 0)
     if transient.sha256() == wanted:

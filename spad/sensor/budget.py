@@ -22,6 +22,7 @@ from spad.sensor.model import PhotonBudget, Sensor, detector_maps
 # G-173 about 0.9, and / pi is 0.26 to 0.29; bright haze and sunlit clouds are about as bright. Silicon SPADs see most
 # of the sun, 1.6 W/(m^2 nm) outside the atmosphere, near 500 nm: 0.5.
 BRIGHT_SKY_W_PER_M2_SR_NM = 0.5
+MIN_OPTICS, MAX_OPTICS = 1e-12, 1e12  # of any length, energy and f-number: their squares stay finite
 WAVELENGTHS_M = (1e-7, 1e-4)  # of light that is timed: 850 nm is 8.5e-7
 
 
@@ -36,8 +37,8 @@ class Optics:
     filter_nm         width of the band that the filter lets through
     wavelength_m      of the laser
 
-    Raises InputError for values that are not above 0, a pulse energy below 0, a transmission above 1, and a wavelength
-    outside 0.1 to 100 micrometres.
+    Raises InputError for values outside 1e-12 to 1e12, a pulse energy below 0, a transmission outside (0, 1], and a
+    wavelength outside 0.1 to 100 micrometres.
 
     Examples
     --------
@@ -66,9 +67,9 @@ class Optics:
         normalise_fields(self, "optics")
         for name in ("pulse_energy_j", "focal_length_m", "f_number", "pixel_pitch_m", "filter_nm", "wavelength_m"):
             value = getattr(self, name)
-            off = name == "pulse_energy_j"  # which a laser may be: background alone
-            good = math.isfinite(value) and (value > 0 or (off and value == 0))
-            require(good, f"optics: {name} {value:g} must be finite and {'0 or more' if off else 'above 0'}")
+            least = 0.0 if name == "pulse_energy_j" else MIN_OPTICS  # a laser may be off: background alone
+            limit = f"optics: {name} {value:g} is outside {least:g} to {MAX_OPTICS:g}"
+            require(least <= value <= MAX_OPTICS, limit)
         lowest, highest = WAVELENGTHS_M
         outside = f"optics: wavelength_m {self.wavelength_m:g} is outside {lowest:g} to {highest:g}"
         require(lowest <= self.wavelength_m <= highest, outside)

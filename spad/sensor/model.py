@@ -20,6 +20,7 @@ from spad.sensor.tdc import Tdc
 
 Reset = Literal["synchronous", "free-running"]
 HOT_RATE_HZ = 1e4  # of hot pixels in a sensor file that gives their share alone, as with `sense --hot-pixels`
+MAX_RATE_HZ = 1e12  # of dark counts: one a picosecond, far above any device; sums over pixels stay finite
 NUMBERS = (  # fields of a sensor that are one number each
     *("bin_width_s", "period_s", "exposure_s", "pde", "hot_share", "hot_rate_hz", "dead_share", "dead_time_s"),
     "crosstalk",
@@ -93,7 +94,7 @@ class Sensor:
         require(whole, f"{where}: period {self.period_s:g} s is not a whole number of bin widths, {self.bins} or more")
         require(
             math.isfinite(self.exposure_s) and self.exposure_s >= self.period_s,
-            f"{where}: exposure {self.exposure_s:g} s is shorter than the period {self.period_s:g} s",
+            f"{where}: exposure {self.exposure_s:g} s is not finite or shorter than the period {self.period_s:g} s",
         )
         self._check_detector(where)
 
@@ -120,9 +121,7 @@ class Sensor:
         require(isinstance(self.pulse, kinds), f"{where}: {self.pulse!r} is no pulse")
         require(self.jitter is None or isinstance(self.jitter, kinds), f"{where}: jitter {self.jitter!r} is no pulse")
         for rate in (*self._dark_rows, self.hot_rate_hz):
-            require(
-                math.isfinite(rate) and rate >= 0, f"{where}: dark count rate {rate:g} Hz is negative or not finite"
-            )
+            require(0 <= rate <= MAX_RATE_HZ, f"{where}: dark count rate {rate:g} Hz is outside 0 to {MAX_RATE_HZ:g}")
         for label in ("hot_share", "dead_share"):
             fraction = getattr(self, label)
             require(0 <= fraction <= 1, f"{where}: {label} {fraction:g} is outside 0 to 1")
@@ -288,15 +287,16 @@ def detector_maps(
 def check_dark_map(measured_hz: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return a measured map's dark counts per second (H, W), 0 in dead pixels, and which are dead (NaN).
 
-    Raises InputError for another shape, and for rates that are negative or infinite.
+    Raises InputError for another shape, and for rates below 0 or above `MAX_RATE_HZ`.
     """
     measured = np.asarray(measured_hz, dtype=np.float64)
     if measured.shape != shape:
         raise InputError(f"dark count map is {measured.shape}, the image {shape}")
     dead = np.isnan(measured)
     measured = np.where(dead, 0.0, measured)
-    if not (np.isfinite(measured).all() and measured.min(initial=0) >= 0):
-        raise InputError("dark count map: rates must be finite and 0 or more, NaN for a dead pixel")
+    if not (measured.min(initial=0) >= 0 and measured.max(initial=0) <= MAX_RATE_HZ):
+        limit = f"rates must be finite and 0 or more, at most {MAX_RATE_HZ:g} Hz, NaN for a dead pixel"
+        raise InputError(f"dark count map: {limit}")
     return measured, dead
 
 

@@ -278,6 +278,20 @@ def test_what_is_no_number_is_answered_with_what_is_expected(words, message, cap
     assert (status, err) == (2, f"scene2spad: {message}\n")
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--fps", "abc"], "--fps abc, expected numbers"),
+        (["--photons", "5", "x"], "--photons 5 x, expected numbers"),
+        (["--codes", "8", "1.5"], "--codes 8 1.5, expected whole numbers"),
+        (["--pixels", "many"], "--pixels many, expected whole numbers"),
+    ],
+)
+def test_lists_of_what_are_no_numbers_are_answered_alike(words, message, capsys):
+    status, _, err = run(capsys, "ultraphase", "sweep", *words)
+    assert (status, err) == (2, f"scene2spad: {message}\n")
+
+
 def test_a_card_says_what_was_not_recorded(capfd):
     """In words on the terminal; JSON keeps null and an empty object."""
     name = "learned-256x4x4-128x-tdc-s0"

@@ -201,6 +201,11 @@ def test_help_says_that_a_checkpoint_is_needed(capsys, monkeypatch):
     assert "compared with. (required)" in " ".join((shown.out + shown.err).replace("│", " ").split())
 
 
+def test_a_sheet_of_an_endless_set_has_a_limit(tmp_path, capsys):
+    assert main(["scenes", "rooms", "--sheet", str(tmp_path / "s.png"), "--count", "1000000000000"]) == 2
+    assert capsys.readouterr().err == "scene2spad: --count 1000000000000 is more than 1000 views\n"
+
+
 @pytest.mark.parametrize("dry", [(), ("--dry-run",)])
 @pytest.mark.parametrize("address", ["nowhere", "tcp://host", "tcp://host:0", "tcp://host:99999", "host:8786:1"])
 def test_what_is_no_address_is_refused_before_the_set_is_looked_at(tmp_path, capsys, monkeypatch, address, dry):

@@ -231,6 +231,8 @@ def test_a_transient_beside_is_used_only_if_it_is_the_right_one(tmp_path, capfd)
     assert payload(tmp_path / "gallery.histogram.html")["returns"] is None
     assert main(["show", "gallery.h5", "--transient", str(other)]) == 2
     assert "is not the transient" in capfd.readouterr().err
+    assert main(["show", "gallery.h5", "--transient", "missing"]) == 2
+    assert capfd.readouterr().err == "scene2spad: missing: file not found\n"
 
 
 def test_pages_of_a_transient_and_of_its_histogram_do_not_overwrite_one_another(tmp_path, capfd):

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from scene2spad.cli.opening import kind_of, open_coding, open_depth, open_histogram, open_transient, pixel_sensor
-from scene2spad.cli.paths import Mark, begins, check_target, keep_foreign
+from scene2spad.cli.paths import Mark, begins, check_target, input_file, keep_foreign
 from scene2spad.options.common import Common, File, GivenFile, Positional, may_stay_open, only_for
 from scenes.errors import InputError, require
 from scenes.io.hdf5 import HDF5_SUFFIXES
@@ -145,7 +145,7 @@ def _depth_of(command: Export, kind: str) -> tuple[np.ndarray, np.ndarray, np.nd
         sure = np.ones_like(found.depth_m) if found.confidence is None else found.confidence
         bright = np.ones_like(found.depth_m)
         if command.intensity is not None:
-            histogram = open_histogram(command.intensity)
+            histogram = open_histogram(input_file(command.intensity))
             bright = histogram.counts.sum(axis=2, dtype=np.int64).astype(np.float32)
             require(bright.shape == found.depth_m.shape, f"{command.intensity}: is of another size than {command.file}")
             if found.meta.get("histogram_sha256") != histogram.sha256():

@@ -8,10 +8,12 @@ from typing import Annotated
 
 from scene2spad.cli.paths import PNG_FIGURE, check_target, keep_foreign
 from scene2spad.options.common import Common, File, Pixels, Positional, may_stay_open, only_for
-from scenes.errors import InputError, require
+from scenes.errors import require
 from scenes.library.catalog import SCENES, load_scene
 from scenes.library.sets import SETS, scene_set
 from scenes.progress import Progress
+
+MAX_SHEET = 1000  # views; sets of rooms have no end
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +25,7 @@ class Scenes(Common):
     sheet: File = None
     """Draw a contact sheet of the set's first views to this .png."""
     count: int = 48
-    """Views on the sheet, or all of a smaller set."""
+    """Views on the sheet, at most 1,000, or all of a smaller set."""
     width: Pixels = None
     """Width of the sheet's views, pixels (default: 128 in 4:3 of rooms, the scene's own of others)."""
 
@@ -65,8 +67,9 @@ def _sheet(command: Scenes, path: Path, progress: Progress) -> dict:
     check_target(path)
     keep_foreign(path, PNG_FIGURE)
     of = scene_set(command.scene or "rooms")
-    if command.count < 1:
-        raise InputError(f"count {command.count} is less than 1")
+    require(command.count >= 1, f"--count {command.count} is less than 1")
+    endless = of.size is None
+    require(not endless or command.count <= MAX_SHEET, f"--count {command.count} is more than {MAX_SHEET} views")
     check_sides(() if command.width is None else (command.width,))
     count = command.count if of.size is None else min(of.size, command.count)
     width, height = command.width, None

@@ -103,7 +103,12 @@ def _asked_pulse(command: Sense) -> AnyPulse | None:
     require(command.pulse_fwhm is not None or not command.pulse_tail, "--pulse-tail needs --pulse-fwhm")
     if command.pulse is not None and command.pulse_step is not None:
         return read_pulse(command.pulse, command.pulse_step)
-    return None if command.pulse_fwhm is None else Pulse(command.pulse_fwhm / FWHM_PER_SIGMA, command.pulse_tail)
+    if command.pulse_fwhm is None:
+        return None
+    try:
+        return Pulse(command.pulse_fwhm / FWHM_PER_SIGMA, command.pulse_tail)
+    except InputError as error:  # speaks of sigma
+        raise InputError(f"--pulse-fwhm {command.pulse_fwhm:g}, --pulse-tail {command.pulse_tail:g}: {error}") from None
 
 
 def optics_of(command: Sense) -> Optics | None:
@@ -115,7 +120,13 @@ def optics_of(command: Sense) -> Optics | None:
     require(not given, "--radiometric computes the photon budget: leave out --signal and --background")
     asked = {field: getattr(command, option) for option, field in OPTICS.items()}
     optics = load_sensor(command.sensor).optics or DEFAULT_OPTICS
-    return replace(optics, **{name: value for name, value in asked.items() if value is not None})
+    try:
+        return replace(optics, **{name: value for name, value in asked.items() if value is not None})
+    except InputError as error:  # speaks of fields
+        words = str(error)
+        for option, field in OPTICS.items():
+            words = words.replace(f"optics: {field} ", f"--{option.replace('_', '-')} ")
+        raise InputError(words) from None
 
 
 def budget_of(command: Sense) -> PhotonBudget:
