@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from numbers import Integral, Real
 from typing import Literal, get_args
@@ -24,6 +23,7 @@ BATCHES = 4
 MIN_SPP = 16  # paths a pixel of the darkest block, since pilots are short; fewer are traced only where asked for
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
+MAX_PHOTONS = 1e9  # of a budget, as a sensor takes it
 MAX_GRID = 64  # that can be forced
 MAX_AMBIENT_SPP = 1 << 12
 # Indirect returns of one pixel merge within so many metres of path, and this share of the path behind the direct light.
@@ -136,10 +136,10 @@ class RenderSettings:
                 raise InputError(f"render: budget {self.budget!r}, {expected}")
             signal, background = (require_number(mean, "render: budget of") for mean in pair)
             object.__setattr__(self, "budget", (signal, background))
-            if not (math.isfinite(signal) and math.isfinite(background) and signal > 0 and background >= 0):
+            if not (0 < signal <= MAX_PHOTONS and 0 <= background <= MAX_PHOTONS):
                 raise InputError(
                     f"render: budget of {signal:g} signal, {background:g} background photons a pixel, expected signal "
-                    "above 0 and background of 0 or more"
+                    f"above 0 and background of 0 or more, at most {MAX_PHOTONS:g}"
                 )
         if self.budget is not None and self.error is not None:
             raise InputError("render: give an error target or a photon budget, not both")

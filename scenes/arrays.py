@@ -139,12 +139,13 @@ def finite_number(value: object, what: str) -> float:
     return number
 
 
-def three_numbers(value: object, what: str) -> tuple[float, float, float]:
-    """Return a point or a direction as three floats, or an InputError."""
+def three_numbers(value: object, what: str, most: float = math.inf) -> tuple[float, float, float]:
+    """Return a point or a direction as three floats of magnitude `most` or less, or an InputError."""
     try:
         x, y, z = (finite_number(number, what) for number in value)  # type: ignore[attr-defined]
     except (TypeError, ValueError):  # of which InputError is one
         raise InputError(f"{what} {value!r} is not three finite numbers") from None
+    require(max(abs(x), abs(y), abs(z)) <= most, f"{what} {value!r} is outside {-most:g} to {most:g} in a coordinate")
     return x, y, z
 
 

@@ -255,7 +255,7 @@ class Laser:
 
     def __post_init__(self) -> None:
         require_choice(self.mode, LASER_MODES, "laser mode")
-        object.__setattr__(self, "baseline_m", three_numbers(self.baseline_m, "laser baseline [m]"))
+        object.__setattr__(self, "baseline_m", three_numbers(self.baseline_m, "laser baseline [m]", MAX_COORDINATE_M))
         if self.cone_deg is not None:
             object.__setattr__(self, "cone_deg", finite_number(self.cone_deg, "laser cone"))
             good = MIN_CONE_DEG <= self.cone_deg <= 360

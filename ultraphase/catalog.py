@@ -180,7 +180,15 @@ class Method:
 
 def method(name: str) -> Method:
     """Return the method of a name such as `fourier-16`, or `coarse-16-shift-2`: shifts of at most 2 bits an
-    instruction."""
+    instruction. Raises InputError for another name, and for a number of codes that no program has.
+
+    Examples
+    --------
+    >>> import ultraphase
+    >>> fourier = ultraphase.method("fourier-8")
+    >>> fourier.title, len(fourier.program().words)
+    ('truncated Fourier, K = 8', 96)
+    """
     found = re.fullmatch(r"([a-z]+)-(\d{1,4})(?:-shift-(\d{1,2}))?", name) if isinstance(name, str) else None
     if not found or found[1] not in FAMILIES:
         raise InputError(f"program {name!r}: expected a file (.s) or FAMILY-K with one of {', '.join(FAMILIES)}")

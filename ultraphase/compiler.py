@@ -132,7 +132,21 @@ def _ways(block: tuple[int, int]) -> np.ndarray:
 
 def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
     """Return program and tables of a code. Raises InputError in one line that names the bytes needed and there, and
-    what would fit: fewer codes, a shorter or longer block, or a table that the cores of a block share."""
+    what would fit: fewer codes, a shorter or longer block, or a table that the cores of a block share.
+
+    Examples
+    --------
+    Two codes of blocks of 32 time bins, as a table. A photon adds to 2 of 64 sums, two for each block:
+
+    >>> import numpy as np
+    >>> import ultraphase
+    >>> table = np.stack([np.arange(32), 31 - np.arange(32)])
+    >>> compiled = ultraphase.compile_code(ultraphase.IntegerCode("ramps", table))
+    >>> compiled.matrix.shape  # cores of the block, sums of a core, timestamps
+    (1, 1, 64, 1024)
+    >>> compiled.matrix[0, 0, :2, 3]
+    array([ 3, 28])
+    """
     chip = chosen_chip(chip, "compile_code")
     known = chip.timestamps % code.bins == 0 and code.bins & (code.bins - 1) == 0
     require(known, f"code {code.name}: blocks of {code.bins} bins, expected a power of two up to {chip.timestamps}")

@@ -84,6 +84,19 @@ def quantised(coding: CodingTensor) -> Quantised:
     The result is one 8-bit tensor, of separable factors their product in integers. A tensor that is in steps already
     keeps them. Programs of a core have tables of their own (`ultraphase.compiler`). All codes share a step: a warning
     names those of which fewer than FEW_STEPS are left.
+
+    Examples
+    --------
+    >>> import torch
+    >>> import csph
+    >>> from scene2spad import coding_tensor
+    >>> in_bytes = csph.quantised(coding_tensor("fourier", 8))
+    >>> tuple(in_bytes.tensor.shape), in_bytes.tensor.dtype, round(1 / in_bytes.scale)
+    ((8, 1024, 1, 1), torch.int8, 127)
+    >>> counts = torch.zeros(1, 1, 1024, 2, 2)  # (B, 1, T, R, C)
+    >>> counts[0, 0, 0] = 300
+    >>> csph.encode_int16(counts, in_bytes).overflows  # 300 x 127 leaves 16 bits: four codes of four pixels
+    16
     """
     steps = coding.steps or (None, None)
     spatial = (None, 1.0) if coding.spatial is None else _to_int8(coding.spatial, steps[1])

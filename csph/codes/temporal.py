@@ -43,6 +43,14 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
     `random`'s.
 
     Raises InputError for another name and for K that is no whole number or does not fit the code.
+
+    Examples
+    --------
+    >>> import csph
+    >>> import spad
+    >>> csph.temporal_code("coarse", 2, 4, spad.sensor_by_name("reference"))
+    tensor([[1., 1., 0., 0.],
+            [0., 0., 1., 1.]])
     """
     makers = {
         "fourier": lambda: truncated_fourier(codes, bins),
@@ -66,6 +74,13 @@ def truncated_fourier(codes: int, bins: int, rows: Rows = "centred") -> Tensor:
     `rows` = "published": cos(2 pi f i / T), and -sin. No harmonic 0, so that rows sum to zero and a uniform background
     leaves no trace; none from T/2 on, where the sine or the cosine vanishes. Raises InputError unless K is even and
     2 <= K <= T - 2.
+
+    Examples
+    --------
+    >>> import csph
+    >>> waves = csph.truncated_fourier(4, 16)
+    >>> tuple(waves.shape), waves.sum(dim=1).abs().max().item() < 1e-5
+    ((4, 16), True)
     """
     return torch.from_numpy(truncated_waves(codes, bins, rows))
 

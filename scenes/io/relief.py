@@ -35,6 +35,8 @@ MIDDLEBURY_FILES = ("view1.png", "disp1.png", "dmin.txt")
 DATA_VARIABLE = "SCENE2SPAD_DATA"
 DEPTH_EXTENSIONS = (".png", ".exr")
 MAX_DEPTH_M = 1e4
+FOCAL_PX = (1e-3, 1e9)  # outside, the angle of any image is beyond the limits of a camera
+SCALE_M = (1e-12, 1e4)  # metres of one level of a depth image
 
 
 @dataclass(frozen=True)
@@ -51,15 +53,19 @@ class RgbdFiles:
     cosine: bool = False
 
     def __post_init__(self) -> None:
-        require(
-            math.isfinite(self.focal_px) and self.focal_px > 0, f"focal length {self.focal_px:g} px is not positive"
-        )
+        low, high = FOCAL_PX
+        require(self.focal_px > 0, f"focal length {self.focal_px:g} px is not positive")
+        require(low <= self.focal_px <= high, f"focal length {self.focal_px:g} px is outside {low:g} to {high:g}")
         kind = Path(self.depth).suffix.lower()
         require(kind in DEPTH_EXTENSIONS, f"{self.depth}: depth image {kind or '(none)'}, expected .png or .exr")
         known = self.scale_m is not None or kind == ".exr"
         require(known, f"{self.depth}: the unit of an integer depth image is not known; give its scale, metres a level")
-        good = self.scale_m is None or (math.isfinite(self.scale_m) and self.scale_m > 0)
-        require(good, f"depth scale {self.scale_m} m a level is not positive")
+        low, high = SCALE_M
+        if self.scale_m is not None:
+            require(self.scale_m > 0, f"depth scale {self.scale_m} m a level is not positive")
+            require(
+                low <= self.scale_m <= high, f"depth scale {self.scale_m:g} m a level is outside {low:g} to {high:g}"
+            )
 
 
 def relief(

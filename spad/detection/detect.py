@@ -56,6 +56,15 @@ def sense(
     and in the brightest thousandth of pixels, and the median pixel's signal (`spad.detection.glints`). Raises
     InputError for an unknown law, first-photon where the dead time is longer than the period, and more than 2^31 - 1
     counts in a bin.
+
+    Examples
+    --------
+    >>> import spad
+    >>> from render import RenderSettings, render
+    >>> from scenes.library.catalog import load_scene
+    >>> transient = render(load_scene("plane", width=8, height=6), RenderSettings(bounces=1))
+    >>> spad.sense(transient, spad.Sensor(), spad.PhotonBudget(signal=20, background=5)).counts.shape
+    (6, 8, 1024)
     """
     exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
     return Histogram(counts=counts_of(exposure, progress), sensor=sensor, budget=budget, **truth)

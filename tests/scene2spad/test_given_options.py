@@ -120,6 +120,15 @@ def refused(capfd, argv: list[str]) -> str:
         ("render photo.png --focal 0", "an RGB-D pair needs --depth FILE and --focal PIXELS"),
         ("render photo.png --depth d.png --focal 0 --depth-scale 0.001", "focal length 0 px is not positive"),
         ("render photo.png --depth d.png --focal 9 --depth-scale 0", "depth scale 0.0 m a level is not positive"),
+        ("render photo.png --depth d.png --focal 1e-308 --depth-scale 1", "focal length 1e-308 px is outside 0.001 to"),
+        (
+            "render photo.png --depth d.png --focal 9 --depth-scale 1e308",
+            "depth scale 1e+308 m a level is outside 1e-12",
+        ),
+        (
+            "render plane --budget 1e308 10",
+            "budget of 1e+308 signal, 10 background photons a pixel, expected signal above",
+        ),
         ("render living-room --depth-scale 0", "an RGB-D pair needs --depth FILE"),
         ("render living-room --cosine", "an RGB-D pair needs --depth FILE"),
         ("train --devices 0", "train: --devices 0 is below 1"),

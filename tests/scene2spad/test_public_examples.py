@@ -41,6 +41,24 @@ def failures(place: str) -> int:
     return sum(doctest.DocTestRunner().run(one).failed for one in examples_of(named(place), place))
 
 
+PACKAGES_OF_STAGES = ("csph", "render", "spad", "ultraphase")
+MORE = [f"{one}.{name}" for one in PACKAGES_OF_STAGES for name in importlib.import_module(one).__all__]
+IN_STAGES = ("csph.quantised", "csph.temporal_code", "csph.truncated_fourier", "spad.estimate_depth", "spad.sense",
+             "ultraphase.compile_code", "ultraphase.method")  # fmt: skip
+
+
+@pytest.mark.parametrize("path", MORE)
+def test_examples_of_the_stages_run(path):
+    """Names that `scene2spad` offers as well are run below; of the others, those of IN_STAGES have an example."""
+    package, name = path.split(".")
+    thing = getattr(importlib.import_module(package), name)
+    if any(thing is getattr(s2s, one) for one in s2s.__all__):
+        return
+    examples = examples_of(thing, name)
+    assert examples or path not in IN_STAGES
+    assert not sum(doctest.DocTestRunner().run(one).failed for one in examples)
+
+
 @pytest.mark.parametrize("name", s2s.__all__)
 def test_every_public_name_has_an_example_that_runs(name, tmp_path, monkeypatch):
     provide_deepinv(monkeypatch)

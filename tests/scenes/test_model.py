@@ -159,6 +159,7 @@ def test_look_at_refuses_a_view_without_direction(origin, target, up):
         ({"mode": "sweep"}, "'sweep'"),
         ({"baseline_m": (0.1, 0.2)}, "is not three finite numbers"),
         ({"baseline_m": (0.1, NAN, 0)}, "is not three finite numbers"),
+        ({"baseline_m": (0, 1e308, 0)}, "outside -1e+07 to 1e+07 in a coordinate"),
         ({"cone_deg": 0.0}, "outside (0, 360]"),
         ({"cone_deg": 1e-7}, "laser cone 1e-07 degrees is outside (0, 360], 1e-06 at least"),
         ({"cone_deg": 361.0}, "outside (0, 360]"),
