@@ -187,7 +187,7 @@ def method(name: str) -> Method:
     >>> import ultraphase
     >>> fourier = ultraphase.method("fourier-8")
     >>> fourier.title, len(fourier.program().words)
-    ('truncated Fourier, K = 8', 96)
+    ('truncated Fourier 1024 x 1 x 1, K = 8', 96)
     """
     found = re.fullmatch(r"([a-z]+)-(\d{1,4})(?:-shift-(\d{1,2}))?", name) if isinstance(name, str) else None
     if not found or found[1] not in FAMILIES:

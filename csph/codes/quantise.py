@@ -92,7 +92,7 @@ def quantised(coding: CodingTensor) -> Quantised:
     >>> from scene2spad import coding_tensor
     >>> in_bytes = csph.quantised(coding_tensor("fourier", 8))
     >>> tuple(in_bytes.tensor.shape), in_bytes.tensor.dtype, round(1 / in_bytes.scale)
-    ((8, 1024, 1, 1), torch.int8, 127)
+    ((8, 1024, 1, 1), dtype('int8'), 127)
     >>> counts = torch.zeros(1, 1, 1024, 2, 2)  # (B, 1, T, R, C)
     >>> counts[0, 0, 0] = 300
     >>> csph.encode_int16(counts, in_bytes).overflows  # 300 x 127 leaves 16 bits: four codes of four pixels

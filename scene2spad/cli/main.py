@@ -238,7 +238,9 @@ def _unparsed(text: str) -> str:
     if found is None or "..." in found[2]:
         return ""
     implied = {"for int()": ["INT"], "to float": ["FLOAT"]}
-    kinds = re.findall(r"\b(?:INT|FLOAT)\b", found[2]) or next((k for w, k in implied.items() if w in found[2]), [])
+    metavar = re.search(rf"Argument helptext: {found[1]}((?: (?:INT|FLOAT))+)", text)
+    named = re.findall(r"\b(?:INT|FLOAT)\b", found[2] if metavar is None else metavar[1])
+    kinds = named or next((k for w, k in implied.items() if w in found[2]), [])
     given = " ".join(re.findall(r"'(.*?)'", found[2]))
     several = re.search(rf"Argument helptext: {found[1]} \[(INT|FLOAT) \[", text)
     if several is not None and given:

@@ -292,6 +292,11 @@ def test_lists_of_what_are_no_numbers_are_answered_alike(words, message, capsys)
     assert (status, err) == (2, f"scene2spad: {message}\n")
 
 
+def test_a_block_that_is_not_whole_is_answered_with_what_is_expected(capsys):
+    status, _, err = run(capsys, "train", "--block", "1.5", "2", "2")
+    assert (status, err) == (2, "scene2spad: --block 1.5 2 2, expected 3 whole numbers\n")
+
+
 def test_a_card_says_what_was_not_recorded(capfd):
     """In words on the terminal; JSON keeps null and an empty object."""
     name = "learned-256x4x4-128x-tdc-s0"
