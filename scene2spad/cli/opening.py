@@ -65,7 +65,10 @@ def kind_of(path: Path) -> str:
     if not path.suffix and len(path.parts) == 1 and not path.exists():
         from csph.weights.cards import shipped_model
 
-        shipped_model(path.name)
+        try:
+            shipped_model(path.name)
+        except InputError as error:
+            raise InputError(f"{path}: file not found, and {error}") from None
         return "network"
     if path.suffix.lower() == ".mat":
         from spad.formats.mat import PULSE_NAME

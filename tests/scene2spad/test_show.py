@@ -330,6 +330,7 @@ def test_integers_of_an_array_have_their_step_beside_them(tmp_path, capfd):
     ("argv", "message"),
     [
         (["show", "nothing.h5"], "file not found"),
+        (["show", "nothing"], "nothing: file not found, and model 'nothing' is unknown"),
         (["show", "gallery.h5", "--out", "a.jpg"], "must end in .html"),
         (["show", "mine.npy", "--out", "a.gif"], "has nothing to play"),
         (["show", "set.h5", "--view", "7"], "no view 7"),
