@@ -34,7 +34,7 @@ SCHEDULES: tuple[str, ...] = ("steps", "cosine")
 SenseOn = Literal["host", "device"]
 SENSE_ON: tuple[str, ...] = ("host", "device")
 PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
-MAX_STEPS, MAX_THREADS = 10**8, 1024
+MAX_STEPS, MAX_THREADS, MAX_WEIGHT = 10**8, 1024, 1e6
 COUNT_BYTES = 4 * 4  # of a batch: counts, logits, their gradient and the target, in float32
 
 
@@ -248,12 +248,13 @@ class TrainConfig:
         terms = {"tv_weight": "total variation", "decoded_weight": "decoded error", "coherence": "coherence"}
         for name, term in terms.items():
             weight = getattr(self, name)
-            require(0 <= weight < math.inf, f"training: weight {weight:g} of the {term} is negative or infinite")
+            good = 0 <= weight <= MAX_WEIGHT
+            require(good, f"training: weight {weight:g} of the {term} is outside 0 to {MAX_WEIGHT:g}")
         several = math.prod(self.model.block[1:]) > 1
         refusal = f"training: weight {self.coherence:g} of the coherence is for codes over several pixels"
         require(several or not self.coherence, f"{refusal}, not {self.model.name}")
-        good = isinstance(self.weights, list | tuple)
-        require(good, f"training: weights {self.weights!r}, expected a number for each training set")
+        listed = isinstance(self.weights, list | tuple)
+        require(listed, f"training: weights {self.weights!r}, expected a number for each training set")
         object.__setattr__(self, "weights", tuple(require_number(one, "training: set weight") for one in self.weights))
         weighted = all(math.isfinite(weight) and weight > 0 for weight in self.weights)
         require(weighted, f"training: set weights {', '.join(map(str, self.weights))} are not all positive")

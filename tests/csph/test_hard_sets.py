@@ -57,8 +57,8 @@ def test_sets_without_light_or_truth_are_refused_before_the_first_step(training,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"coherence": math.inf}, "weight inf of the coherence is negative or infinite"),
-        ({"tv_weight": math.inf}, "weight inf of the total variation is negative or infinite"),
+        ({"coherence": math.inf}, r"weight inf of the coherence is outside 0 to 1e\+06"),
+        ({"tv_weight": math.inf}, r"weight inf of the total variation is outside 0 to 1e\+06"),
         ({"seed": -1}, "seed -1 is outside 0 to 9223372036854775807"),
         ({"seed": MAX_SEED + 1}, "seed 9223372036854775808 is outside 0 to 9223372036854775807"),
     ],

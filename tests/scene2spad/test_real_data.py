@@ -148,5 +148,6 @@ def test_mistakes_end_in_one_line(capfd, folder):
     assert "not tiled by 2 x 2" in refused(capfd, "--capture", "odd.mat")
     assert "frame 3 is not one of its 1" in refused(capfd, "--capture", "odd.mat", "--frame", "3")
     assert "two of one name" in refused(capfd, "--capture", "odd.mat", "odd.mat")
+    assert not (folder / "out").exists()
     assert "network for 512 bins" in refused(capfd, "--checkpoints", "short.safetensors")
     assert "file not found" in refused(capfd, "--checkpoints", "none.safetensors")

@@ -104,7 +104,6 @@ def run(command: Study, progress: Progress) -> dict:
         bins = model.config.sensor.bins
         require(bins == BINS, f"{path}: a network for {bins} bins, captures are resampled to {BINS}")
     by_compression = methods_of([model for _, model in networks])
-    command.out.mkdir(parents=True, exist_ok=True)
     if command.capture:
         names = [path.stem for path in command.capture]
         require(len({*names}) == len(names), f"captures {' '.join(names)}: two of one name")
@@ -112,6 +111,7 @@ def run(command: Study, progress: Progress) -> dict:
         note = f"Captures given: {', '.join(names)}, frame {command.frame}; no truth, field of view {FOV_DEG:g} degrees"
     else:
         views, note = _rendered(command, progress), NOT_REAL
+    command.out.mkdir(parents=True, exist_ok=True)
     methods = {label: method for found in by_compression.values() for label, method in found.items()}
     depths = {}
     for number, view in enumerate(views):
