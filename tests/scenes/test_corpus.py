@@ -185,7 +185,7 @@ BAD_PAIRS = {
     "colours as depth": (np.random.default_rng(0).integers(0, 255, (8, 8, 3)).astype(np.uint8), {}, "one channel"),
     "other proportions": (np.full((4, 16), 900, np.uint16), {}, "other proportions"),
     "no focal length": (np.full((8, 8), 900, np.uint16), {"focal_px": 0.0}, "focal length"),
-    "wrong scale": (np.full((8, 8), 900, np.uint16), {"scale_m": 1e6}, "check the scale"),
+    "wrong scale": (np.full((8, 8), 900, np.uint16), {"scale_m": 1e3}, "check the scale"),
 }
 
 
