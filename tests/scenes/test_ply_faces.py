@@ -17,7 +17,8 @@ from scenes.placing import Placing
 from tests.scenes.xml_files import load
 
 AS_FILE = Placing(scale=1, bare=True)
-TYPES = {"uchar": "u1", "ushort": "u2", "int": "i4", "uint": "u4", "int64": "i8", "float": "f4", "double": "f8"}
+TYPES = {"uchar": "u1", "ushort": "u2", "int": "i4", "uint": "u4", "int64": "i8", "uint64": "u8"}
+TYPES |= {"float": "f4", "double": "f8"}
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 # A box of 1 x 2 x 3 whose sides are two triangles, three quads and a side of a dented hexagon and what it leaves.
 POINTS = np.array([(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 3)] + [(0, 0.5, 1), (0, 1.5, 1)], float)
@@ -196,6 +197,24 @@ def test_each_face_has_the_texture_of_its_number(tmp_path: Path) -> None:
     rows[0][1] = (0, 0, 1, 0)
     content = ply("ascii", [sheet(), ("face", properties, rows)], comments)
     assert "a face of 3 corners has 4 numbers as its texcoord" in refused(tmp_path / "a.ply", content)
+    rows[0][2] = 0.5
+    content = ply("ascii", [sheet(), ("face", [*properties[:2], "float texnumber"], rows)], comments)
+    assert "a face's texnumber is 0.5, expected a whole number" in refused(tmp_path / "a.ply", content)
+
+
+def test_numbers_of_textures_that_are_not_named_part_nothing(tmp_path: Path) -> None:
+    properties = ["list uchar int vertex_indices", "int texnumber"]
+    rows = [[(0, 1, 2), 3], [(2, 3, 4), 0], [(4, 5, 2), -1], [(5, 0, 2), 7]]
+    (found,) = written(tmp_path / "a.ply", ply("binary_little_endian", [sheet(), ("face", properties, rows)])).surfaces
+    assert area(found) == pytest.approx(3)
+
+
+def test_empty_lists_of_coordinates_leave_those_of_vertices(tmp_path: Path) -> None:
+    Image.new("RGB", (4, 4), (128, 128, 128)).save(tmp_path / "skin.png")
+    points = "vertex", [f"float {name}" for name in "xyzst"], [[x, y, 0, x / 2, y / 2] for x, y in SHEET.tolist()]
+    faces = "face", ["list uchar int vertex_indices", "list uchar float texcoord"], [[(0, 1, 2, 3, 4, 5), ()]]
+    (found,) = written(tmp_path / "a.ply", ply("ascii", [points, faces], "comment TextureFile skin.png\n")).surfaces
+    assert isinstance(found.material.albedo, Texture) and found.uv is not None
 
 
 @pytest.mark.parametrize("kind", ORDERS)
@@ -214,7 +233,7 @@ def test_a_list_that_is_none_is_refused(tmp_path: Path) -> None:
 
     assert "refers to vertex 99" in refused(tmp_path / "a.ply", face("int", (0, 1, 99)))
     assert "refers to vertex -1" in refused(tmp_path / "a.ply", face("int", (0, 1, -1)))
-    assert "a face's vertex is no whole number" in refused(tmp_path / "a.ply", face("float", (0, 1, 2.5)))
+    assert "a face's vertex is 2.5, expected a whole number" in refused(tmp_path / "a.ply", face("float", (0, 1, 2.5)))
     cut = ply("binary_little_endian", [vertices(), ("face", ["list char int vertex_indices"], [])])
     cut = cut.replace(b"face 0", b"face 2") + b"\xff" + bytes(4)
     assert "a list of -1 values" in refused(tmp_path / "a.ply", cut)
@@ -223,11 +242,55 @@ def test_a_list_that_is_none_is_refused(tmp_path: Path) -> None:
 
 
 def test_polygons_of_a_mitsuba_scene_are_fans_as_in_an_obj_of_one(tmp_path: Path) -> None:
-    content = ply("binary_little_endian", [vertices(), ("face", ["list uchar int v"], [[one] for one in SIDES])])
-    (tmp_path / "a.ply").write_bytes(content)
+    faces = "face", ["list uchar int v"], [[one] for one in SIDES]
+    textures = "comment TextureFile a.png\ncomment TextureFile b.png\n"  # at which Mitsuba does not look
+    (tmp_path / "a.ply").write_bytes(ply("binary_little_endian", [vertices(), faces], textures))
     (found,) = load(
         tmp_path,
         '<shape type="ply"><string name="filename" value="a.ply"/><boolean name="face_normals" value="true"/></shape>',
     ).surfaces
     assert len(found.faces) == sum(len(side) - 2 for side in SIDES)
     assert (found.faces[-4:, 0] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("-3 0 1 2\n3 0 1 2", "a list of -3 values, of 8 numbers for 2 elements 'face'"),
+        ("1.5 0 1 2\n3 0 1 2", "a list of 1.5 values, of 8 numbers"),
+        ("nan 0 1 2\n3 0 1 2", "a list of nan values, of 8 numbers"),
+        ("1e300 0 1 2\n3 0 1 2", "cut short or damaged: ends within its data, of 8 numbers for 2 elements 'face'"),
+        ("3 0 1 2\n3 0 1", "cut short or damaged: ends within its data, of 7 numbers for 2 elements 'face'"),
+        ("3 0 1 nan\n3 0 1 2", "a face's vertex is nan, expected a whole number"),
+        ("3 0 1 1e30\n3 0 1 2", "a face's vertex is 1e+30, expected a whole number"),
+    ],
+)
+def test_rows_of_a_text_that_cannot_be_are_told_as_they_are(tmp_path: Path, rows: str, words: str) -> None:
+    content = ply("ascii", [vertices(), ("face", ["list uchar int vertex_indices"], [])])
+    assert words in refused(tmp_path / "a.ply", content.replace(b"face 0", b"face 2") + rows.encode() + b"\n")
+
+
+@pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_list_longer_than_any_file_is_refused(tmp_path: Path, kind: str, place: int) -> None:
+    rows = [[side] for side in SIDES[:3]]
+    content = ply(kind, [vertices(), ("face", ["list uint64 int vertex_indices"], rows)])
+    start = len(content) - sum(8 + 4 * len(side) for side in SIDES[place:3])
+    assert "cut short" in refused(tmp_path / "a.ply", content[:start] + b"\xff" * 8 + content[start + 8 :])
+
+
+def test_a_property_of_a_name_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    name, properties, rows = vertices()
+    content = ply("ascii", [(name, [*properties, "float x"], [[*row, 0] for row in rows])])
+    assert "elements 'vertex' have two properties x" in refused(tmp_path / "a.ply", content)
+
+
+def test_data_that_begin_like_the_end_of_a_line_are_data(tmp_path: Path) -> None:
+    """Lines of the header end by CR, and the first byte of the data is that of LF."""
+    points = POINTS.copy()
+    points[0, 0] = np.frombuffer(b"\n\0\0\0", "<f4")[0]
+    elements = [vertices(points), ("face", ["list uchar int vertex_indices"], [[side] for side in SIDES])]
+    head, end, body = ply("binary_little_endian", elements).partition(b"end_header\n")
+    assert body[:1] == b"\n"
+    content = (head + end).replace(b"\n", b"\r") + body
+    assert volume(*written(tmp_path / "a.ply", content).surfaces) == pytest.approx(VOLUME)

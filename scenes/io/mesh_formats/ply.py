@@ -129,8 +129,15 @@ def _header(content: bytes) -> tuple[list[_Declared], str | None, list[str], int
                 elements[-1].properties.append(_Property(name, _PLY_TYPES[value_type], None))
             case ["element" | "property", *_]:
                 raise InputError(f"header line {' '.join(line)!r} is not understood")
+    first = end.end()
+    if end[0].endswith(b"\r\n") and b"\n" not in content[: end.start()]:
+        first -= 1  # lines end by CR alone: the data begin with a byte that looks like LF
+    for one in elements:
+        names = [each.name for each in one.properties]
+        twice = [name for name in names if names.count(name) > 1]
+        require(not twice, f"elements {one.name!r} have two properties {', '.join(dict.fromkeys(twice))}")
     named = [re.match(r"comment +TextureFile +(.+?)\s*$", line, re.IGNORECASE) for line in text]
-    return elements, orders[formats[0]], [one[1] for one in named if one is not None], end.end()
+    return elements, orders[formats[0]], [one[1] for one in named if one is not None], first
 
 
 def _text_lines(body: bytes, declared: list[_Declared]) -> list[str]:
@@ -154,12 +161,15 @@ def _text_columns(lines: list[str], declared: _Declared) -> dict[str, np.ndarray
             f"cut short or damaged: not all of {declared.rows} elements {declared.name!r} are numbers"
         ) from None
     types = [one._replace(type=_TEXT_TYPE, count_type=one.count_type and _TEXT_TYPE) for one in declared.properties]
-    message = f"cut short or damaged: {len(values)} numbers for {declared.rows} elements {declared.name!r}"
+    message = f"{len(values)} numbers for {declared.rows} elements {declared.name!r}"
+    if not any(one.count_type for one in types):
+        expected = declared.rows * len(types)
+        require(len(values) == expected, f"cut short or damaged: {message}, expected {expected}")
     try:
         columns, end = _columns(values.tobytes(), 0, declared._replace(properties=types), "=")
-    except InputError:
-        raise InputError(f"{message}, more are expected, or others") from None
-    require(end == values.nbytes, f"{message}, expected {end // values.itemsize}")
+    except InputError as error:
+        raise InputError(f"{error}, of {message}") from None
+    require(end == values.nbytes, f"cut short or damaged: {message}, expected {end // values.itemsize}")
     return columns
 
 
@@ -171,7 +181,7 @@ def _columns(content: bytes, start: int, declared: _Declared, order: str) -> tup
     if even is not None:
         return even
     starts, end = _row_starts(content, start, declared, order)
-    require(end <= len(content), "cut short: ends within its data")
+    require(end <= len(content), "cut short or damaged: ends within its data")
     columns: dict[str, np.ndarray | Lists] = {}
     at = starts
     for one in declared.properties:
@@ -252,7 +262,7 @@ def _row_starts(content: bytes, start: int, declared: _Declared, order: str) -> 
                     raise InputError(f"a list of {length:g} values")
                 at += count_size + size * int(length)
             at += gap
-    except struct.error:
+    except (struct.error, OverflowError):  # of a length beyond any file
         raise InputError("cut short or damaged: ends within its data") from None
     return np.array(starts), at
 

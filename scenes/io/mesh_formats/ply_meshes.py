@@ -54,10 +54,10 @@ class _Polygons:
     texture: np.ndarray
 
 
-def load_ply(path: Path, *, fans: bool = False) -> list[PlyMesh]:
+def load_ply(path: Path, *, as_mitsuba: bool = False) -> list[PlyMesh]:
     """Return the triangles of a PLY, one mesh a texture; none where it has no faces.
 
-    fans  cut polygons into fans from their first corner, even those with dents
+    as_mitsuba  cut polygons into fans from their first corner, even those with dents; look at no texture
 
     Vertices whose corners have texture coordinates of their own are there once for each of these. Raises InputError in
     one line that begins with the file where it is missing, cut short, or not consistent with what it declares.
@@ -66,7 +66,8 @@ def load_ply(path: Path, *, fans: bool = False) -> list[PlyMesh]:
     try:
         check_kind(content, ".ply")
         try:
-            return _meshes(read_ply(content), path.name, fans)
+            ply = read_ply(content)
+            return _meshes(replace(ply, textures=[]) if as_mitsuba else ply, path.name, as_mitsuba)
         except NotReadError:
             raise
         except InputError as error:
@@ -149,7 +150,9 @@ def _polygons(ply: Ply) -> _Polygons | None:
     numbers = face.numbers("texnumber")
     several = len(ply.textures) > 1 and numbers is None
     require(not several, f"names {len(ply.textures)} textures, and no texnumber says which face has which")
-    texture = np.zeros(face.rows, np.int64) if numbers is None else numbers[:, 0].astype(np.int64)
+    texture = np.zeros(face.rows, np.int64)
+    if numbers is not None and ply.textures:
+        texture = _whole(numbers[:, 0], "texnumber")
     uv, given = _corner_coordinates(face, indices.lengths)
     if uv is not None:
         texture = np.where(given, texture, _NO_TEXTURE)
@@ -170,9 +173,17 @@ def _indices(element: Element) -> Lists:
     named = ", ".join(lists) or "no lists"
     require(len(lists) == 1 or bool(usual), f"its faces have no vertex_indices, but {named}")
     found = lists[usual[0] if usual else named]
-    whole = found.values.astype(np.int64)
-    require(bool((whole == found.values).all()), "a face's vertex is no whole number")
-    return Lists(whole, found.lengths)
+    return Lists(_whole(found.values, "vertex"), found.lengths)
+
+
+def _whole(values: np.ndarray, what: str) -> np.ndarray:
+    """Return numbers of a face in int64; InputError for one that is no whole number, or too large."""
+    with np.errstate(invalid="ignore"):  # of those
+        whole = values.astype(np.int64)
+    wrong = np.flatnonzero(whole != values)
+    if len(wrong):
+        raise InputError(f"a face's {what} is {values[wrong[0]]:.9g}, expected a whole number")
+    return whole
 
 
 def _strip_triangles(strips: Lists) -> np.ndarray:
@@ -191,7 +202,7 @@ def _strip_triangles(strips: Lists) -> np.ndarray:
 def _corner_coordinates(face: Element, lengths: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     """Return the texture coordinates of all corners of faces of so many corners, and which faces have some."""
     lists = face.columns.get("texcoord")
-    if not isinstance(lists, Lists):
+    if not isinstance(lists, Lists) or not lists.lengths.any():
         return None, np.zeros(face.rows, bool)
     given = lists.lengths > 0
     wrong = given & (lists.lengths != 2 * lengths)

@@ -158,7 +158,7 @@ def _read(path: Path, kind: str) -> Mesh:
     import trimesh
 
     if kind == "ply":
-        meshes = [Mesh(one.vertices, one.faces, one.uv, one.normals) for one in load_ply(path, fans=True)]
+        meshes = [Mesh(one.vertices, one.faces, one.uv, one.normals) for one in load_ply(path, as_mitsuba=True)]
     else:
         loaded = load_trimesh(path, f".{kind}", skip_materials=True)
         # trimesh keeps the normals of a file in the cache, where its own exporters look for them too; None if absent.
