@@ -60,6 +60,13 @@ def test_colours_per_vertex_that_are_not_taken_are_noted(tmp_path: Path, library
     assert notes[-2:] == ("a: its colours per vertex are left out", "a: no other colour in the file, albedo 0.6")
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("behind", ["", " # 1 0 0"])
+def test_without_colours_per_vertex_none_is_left_out(tmp_path: Path, end: str, behind: str) -> None:
+    notes = written(tmp_path / "a.obj", (coloured(behind) + FACE).replace("\n", end)).notes
+    assert notes[-1] == "a: no colour in the file, albedo 0.6" and not any("left out" in note for note in notes)
+
+
 @pytest.mark.parametrize("comment", ["#usemtl b", "# usemtl b", "  # no usemtl b"])
 def test_a_material_in_a_comment_is_none(tmp_path: Path, comment: str) -> None:
     (tmp_path / "a.mtl").write_text("newmtl a\nKd 0.25 0.25 0.25\nnewmtl b\nKd 1 1 1\n")

@@ -53,8 +53,8 @@ def _corner(corner: bytes, counts: list[int], line: int) -> bytes:
 
 def has_colours(content: bytes) -> bool:
     """Return whether the first vertex of an OBJ has a colour behind its place, as those of many programs have."""
-    first = re.search(rb"^v[ \t]+.*", content, re.MULTILINE)
-    return first is not None and len(first[0].split()) >= 7
+    first = re.search(rb"(?:^|[\r\n])[ \t]*v[ \t]([^#\r\n]*)", content)
+    return first is not None and len(first[1].split()) >= 6
 
 
 def plain_colours(content: bytes, textured: bool) -> bytes:
@@ -76,7 +76,7 @@ def plain_colours(content: bytes, textured: bool) -> bytes:
         content = re.sub(rb"^v +.*", lambda _: b" ".join(next(scaled)), content, flags=re.MULTILINE)
     if textured:
         return content
-    return re.sub(rb"^f .*", lambda face: _cut_to((False, True), face[0]), content, flags=re.MULTILINE)
+    return re.sub(rb"^f .*/.*", lambda face: _cut_to((False, True), face[0]), content, flags=re.MULTILINE)
 
 
 def alike_obj(content: bytes) -> tuple[bytes, bool]:
