@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from scenes.constants import MAX_PHOTONS
 from scenes.errors import InputError, normalise_fields, require_number
 from scenes.json_types import JsonObject
 
@@ -23,7 +24,6 @@ BATCHES = 4
 MIN_SPP = 16  # paths a pixel of the darkest block, since pilots are short; fewer are traced only where asked for
 FILTERED_BATCHES = 2  # the same of filtered light, whose regions hold a set of sums for each
 GRIDS = (2, 4, 8, 16)
-MAX_PHOTONS = 1e9  # of a budget, as a sensor takes it
 MAX_GRID = 64  # that can be forced
 MAX_AMBIENT_SPP = 1 << 12
 # Indirect returns of one pixel merge within so many metres of path, and this share of the path behind the direct light.

@@ -8,5 +8,7 @@ REFERENCE_BINS = 1024
 REFERENCE_PERIOD_S = 100e-9
 REFERENCE_PULSE_SIGMA_S = 135e-12
 
+MAX_PHOTONS = 1e9  # of a photon budget: mean signal, or mean background, of a pixel and exposure
+
 # Of lasers whose wavelength nobody states: where light at this wavelength is needed (sunlight, a photon budget).
 DEFAULT_WAVELENGTH_M = 850e-9

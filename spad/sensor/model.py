@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from scenes.constants import REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
+from scenes.constants import MAX_PHOTONS, REFERENCE_BINS, REFERENCE_PERIOD_S, SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, require, require_choice, require_number, require_whole
 from scenes.json_types import JsonObject
 from scenes.random_streams import Stream
@@ -325,8 +325,8 @@ class PhotonBudget:
         for label, value in (("signal", self.signal), ("background", self.background)):
             value = require_number(value, f"photon budget: {label}")
             object.__setattr__(self, label, value)
-            good = math.isfinite(value) and 0 <= value <= 1e9
-            require(good, f"photon budget: {label} {value:g} photons per pixel is outside 0 to 1e9")
+            good = 0 <= value <= MAX_PHOTONS
+            require(good, f"photon budget: {label} {value:g} photons per pixel is outside 0 to {MAX_PHOTONS:g}")
 
     @property
     def sbr(self) -> float:
