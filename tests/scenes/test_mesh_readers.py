@@ -13,6 +13,7 @@ from PIL import Image
 
 from scenes import InputError, Scene, Surface
 from scenes.io.mesh_formats import mesh_colours
+from scenes.io.mesh_formats.glb import plain_glb
 from scenes.io.mesh_formats.meshes import load_mesh
 from scenes.io.textures import luminance, srgb_to_linear
 from scenes.placing import Placing
@@ -252,6 +253,18 @@ def test_coordinates_of_a_glb_are_those_that_they_stand_for(tmp_path: Path, attr
     np.testing.assert_allclose(found.vertices, plain.vertices, atol=1e-6)
     assert found.faces.tolist() == plain.faces.tolist()
     np.testing.assert_array_equal(found.material.albedo.image, plain.material.albedo.image)
+
+
+def test_a_glb_whose_coordinates_were_moved_says_nothing_of_a_move(tmp_path: Path) -> None:
+    """Whatever reads it on finds floats of the first set, within the file."""
+    attributes = {"POSITION": (CORNERS * 32767).astype(np.int16), "TEXCOORD_0": UV, "TEXCOORD_1": UV}
+    content = plain_glb(glb(tmp_path / "a.glb", attributes, transformed(scale=[2, 2])).read_bytes())
+    size = struct.unpack_from("<I", content, 12)[0]
+    header = json.loads(content[20 : 20 + size])
+    base = header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    assert base == {"index": 0, "extensions": {}}
+    ends = [view["byteOffset"] + view["byteLength"] for view in header["bufferViews"]]
+    assert max(ends) <= header["buffers"][0]["byteLength"] <= struct.unpack_from("<I", content, 20 + size)[0]
 
 
 def test_a_set_of_coordinates_that_is_not_there_is_noted(tmp_path: Path) -> None:

@@ -128,8 +128,9 @@ def test_strips_are_the_triangles_that_they_stand_for(tmp_path: Path, kind: str)
     strips = [[(0, 2, 1, 3, 0, 2, -1, 4, 6, 5, 7)], [(5, 7, 4, 4, 6, 7)]]
     element = "tristrips", ["list int int vertex_indices"], strips
     content = ply(kind, [vertices(np.concatenate((points, points + 2))), element])
-    (found,) = written(tmp_path / "a.ply", content).surfaces
-    assert len(found.faces) == 8
+    scene = written(tmp_path / "a.ply", content)
+    (found,) = scene.surfaces
+    assert len(found.faces) == 8 and not any("degenerate" in note for note in scene.notes)
     assert volume(found) == pytest.approx(2 / 6)
     both = ply(kind, [vertices(points), ("face", ["list uchar int vertex_index"], [[(0, 1, 2)]]), element])
     assert refused(tmp_path / "b.ply", both).endswith(
@@ -200,6 +201,42 @@ def test_each_face_has_the_texture_of_its_number(tmp_path: Path) -> None:
     rows[0][2] = 0.5
     content = ply("ascii", [sheet(), ("face", [*properties[:2], "float texnumber"], rows)], comments)
     assert "a face's texnumber is 0.5, expected a whole number" in refused(tmp_path / "a.ply", content)
+
+
+def test_coordinates_of_vertices_stay_with_the_faces_of_each_texture(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        Image.new("RGB", (4, 4), (128, 128, 128)).save(tmp_path / name)
+    points = "vertex", [f"float {name}" for name in "xyzst"], [[x, y, 0, x / 2, y / 2] for x, y in SHEET.tolist()]
+    rows = [[(2, 1, 6, 3), 1], [(5, 0, 1, 2), 0], [(5, 2, 3, 4), 0]]
+    faces = "face", ["list uchar int vertex_indices", "int texnumber"], rows
+    comments = "comment TextureFile a.png\ncomment TextureFile b.png\n"
+    scene = written(tmp_path / "a.ply", ply("binary_big_endian", [points, faces], comments))
+    assert [len(one.vertices) for one in scene.surfaces] == [6, 4]
+    assert not any("dropped" in note for note in scene.notes)
+    for one in scene.surfaces:
+        np.testing.assert_allclose(one.uv, (one.vertices[:, :2] + (1, 0)) / 2, atol=1e-6)
+
+
+def test_coordinates_per_corner_leave_the_colours_of_vertices(tmp_path: Path) -> None:
+    """Vertices are there once for each of their coordinates, and colours still count by area."""
+    name, properties, points = sheet()
+    points = [[*row[:6], *[255 * (number in (0, 1))] * 3] for number, row in enumerate(points)]
+    rows = [[(0, 1, 2), mapped((0, 1, 2), 0)], [(2, 3, 4, 5), mapped((2, 3, 4, 5), 0.5)], [(5, 0, 2), (0.5,) * 6]]
+    lists = ["list uchar int vertex_indices", "list uchar float texcoord"]
+    split, whole = (
+        written(
+            tmp_path / "a.ply", ply("ascii", [(name, properties, points), ("face", lists[:of], [r[:of] for r in rows])])
+        )
+        for of in (2, 1)
+    )
+    assert len(split.surfaces[0].vertices) > len(whole.surfaces[0].vertices)
+    assert split.surfaces[0].material.albedo == pytest.approx(whole.surfaces[0].material.albedo, abs=1e-6)
+
+
+def test_more_triangles_than_a_scene_takes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scenes.io.mesh_formats.ply_meshes.MAX_TRIANGLES", 15)
+    content = ply("binary_little_endian", [vertices(), ("face", ["list uchar int v"], [[one] for one in SIDES])])
+    assert refused(tmp_path / "a.ply", content).endswith("a.ply: 16 triangles, expected 15 at most")
 
 
 def test_numbers_of_textures_that_are_not_named_part_nothing(tmp_path: Path) -> None:

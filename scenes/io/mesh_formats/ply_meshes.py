@@ -86,7 +86,8 @@ def _meshes(ply: Ply, name: str, fans: bool) -> list[PlyMesh]:
     check_vertices(points, name)
     check_faces(polygons.corners, len(points), name)
     found = int((polygons.lengths - 2).sum())
-    require(found <= MAX_TRIANGLES, f"{found} triangles, expected {MAX_TRIANGLES} at most")
+    if found > MAX_TRIANGLES:
+        raise NotReadError(f"{found} triangles, expected {MAX_TRIANGLES} at most")
     places, owners = triangulated(points, polygons.corners, polygons.lengths, fans=fans)
     textures = np.unique(polygons.texture)
     parts = [polygons.texture[owners] == number for number in textures]

@@ -63,8 +63,7 @@ def triangulated(
         return triangles, owners
     kept = ~np.isin(owners, [*cut])
     owners = np.concatenate((owners[kept], *(np.full(len(found), number) for number, found in cut.items())))
-    order = np.argsort(owners, kind="stable")
-    return np.concatenate((triangles[kept], *cut.values()))[order], owners[order]
+    return np.concatenate((triangles[kept], *cut.values())), owners
 
 
 def _dented(points: np.ndarray, indices: np.ndarray, ends: np.ndarray) -> list[int]:
