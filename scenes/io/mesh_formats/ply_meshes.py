@@ -108,7 +108,7 @@ def _image(ply: Ply, number: int) -> str | None:
 def _mesh(vertex: Element, points: np.ndarray, polygons: _Polygons, places: np.ndarray, owners: np.ndarray) -> PlyMesh:
     """Return the mesh of triangles, each by its three places among the corners of polygons; `owners` are these."""
     corners = polygons.corners[places]
-    colours, coloured = ply_colours(vertex), "vertex"
+    colours, coloured = _row_colours(vertex), "vertex"
     if colours is None and polygons.colours is not None:
         colours, coloured = polygons.colours[owners], "face"
     normals = vertex.numbers("nx", "ny", "nz")
@@ -157,7 +157,7 @@ def _polygons(ply: Ply) -> _Polygons | None:
     uv, given = _corner_coordinates(face, indices.lengths)
     if uv is not None:
         texture = np.where(given, texture, _NO_TEXTURE)
-    colours = ply_colours(face)
+    colours = _row_colours(face)
     return _Polygons(
         indices.values[of_corners],
         indices.lengths[kept],
@@ -215,7 +215,7 @@ def _corner_coordinates(face: Element, lengths: np.ndarray) -> tuple[np.ndarray 
     return uv, given
 
 
-def ply_colours(element: Element) -> np.ndarray | None:
+def _row_colours(element: Element) -> np.ndarray | None:
     """Return the colours (n, 3) of an element's rows as shares of white; None where it has none.
 
     Whole numbers are shares of the most that their type holds, of 255 where they have 32 bits and none is larger.
