@@ -282,7 +282,8 @@ class DepthModel(nn.Module):
 
     def _trained_overflows(self, counts: Tensor, inside: tuple[slice, slice]) -> int:
         """Count sums that wrap in the cores of a layer with `int8`, of the blocks that reach `inside`; 0 of others."""
-        if self.layer is None or not self.layer.options.int8:
+        # studies put other modules in the layer's place
+        if not isinstance(self.layer, CompressiveLayer) or not self.layer.options.int8:
             return 0
         sums, _ = self.layer.core_sums(self._whole_blocks(counts, inside))
         return int((wrapped_sums(sums) != sums).sum())
