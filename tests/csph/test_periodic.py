@@ -42,7 +42,7 @@ def test_a_delay_moves_the_answer(code, steps):
 
 
 def test_a_delay_around_the_end_of_the_range_leaves_the_network_as_sure():
-    """Of the same light, 32 bins later, the share of the posterior around its own peak is the same."""
+    """Move the light by 32 bins: the share of the posterior around its own peak stays the same."""
     model = DepthModel(PERIODIC, 2).eval()
     early, pulse = np.zeros((8, 8, BINS), np.int32), [3, 9, 3]
     early[..., BINS - 2 :], early[..., 0] = pulse[:2], pulse[2]

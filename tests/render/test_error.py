@@ -125,7 +125,7 @@ def test_plans_say_how_wide_cells_are_and_settings_rule():
 
 
 def just_above_the_floor_of_a_room() -> Scene:
-    """What is seen of the floor is a tenth of a millimetre away, and 10^8 times as bright as the walls."""
+    """Show a floor a tenth of a millimetre away, 10^8 times as bright as the walls."""
     vertices, faces, uv = box((4, 3, 5))
     walls = Surface(vertices + [0, 1.5, 0], faces[:, ::-1], Material(albedo=0.6), uv=uv)
     return Scene("floor", (walls,), Camera.look_at((0, 1e-4, 1), (0, 1e-4, 0), fov_deg=60, width=8, height=8))

@@ -63,7 +63,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Ply:
-    """What a PLY holds: its elements by name, and the textures that its comments name."""
+    """Hold what a PLY says: its elements by name, and the textures that its comments name."""
 
     elements: dict[str, Element]
     textures: list[str]
