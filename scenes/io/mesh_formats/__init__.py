@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from scenes.errors import InputError
 
+# Colours of vertices: fractions of white may exceed 1 a little; any beyond MAX_FRACTION are levels up to MAX_LEVEL.
+MAX_FRACTION, MAX_LEVEL = 2, 255
+
 
 class NotReadError(InputError):
     """A sound file that holds what is not read."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from scenes.errors import require
+from scenes.io.mesh_formats import MAX_FRACTION, MAX_LEVEL
 
 _DIGITS = bytes.maketrans(b"023456789", b"111111111")
 # by whether they have texture coordinates and normals
@@ -62,17 +63,18 @@ def plain_colours(content: bytes, textured: bool) -> bytes:
 
     textured  whether a material of its libraries has a texture; without one, coordinates are of no use
 
-    Numbers beyond 2 are levels up to 255. trimesh takes them for white, and drops colours beside texture coordinates.
+    Numbers beyond MAX_FRACTION are levels up to MAX_LEVEL. trimesh takes them for white, and drops colours beside
+    texture coordinates.
     """
     if not has_colours(content):
         return content
     vertices = [line.split() for line in re.findall(rb"^v +.*", content, re.MULTILINE)]
     try:
-        levels = max(max(map(float, words[4:7]), default=0.0) for words in vertices) > 2
+        levels = max(max(map(float, words[4:7]), default=0.0) for words in vertices) > MAX_FRACTION
     except ValueError:
         return content  # is told elsewhere
     if levels:
-        scaled = iter([words[:4] + [b"%.9g" % (float(word) / 255) for word in words[4:7]] for words in vertices])
+        scaled = iter([words[:4] + [b"%.9g" % (float(word) / MAX_LEVEL) for word in words[4:7]] for words in vertices])
         content = re.sub(rb"^v +.*", lambda _: b" ".join(next(scaled)), content, flags=re.MULTILINE)
     if textured:
         return content

@@ -10,7 +10,7 @@ import numpy as np
 from scenes.arrays import check_faces
 from scenes.errors import InputError, require
 from scenes.io.inputs import read_bytes
-from scenes.io.mesh_formats import NotReadError
+from scenes.io.mesh_formats import MAX_FRACTION, MAX_LEVEL, NotReadError
 from scenes.io.mesh_formats.mesh_files import MAX_TRIANGLES, check_kind, check_vertices
 from scenes.io.mesh_formats.mtl import without_mark
 from scenes.io.mesh_formats.ply import Element, Lists, Ply, read_ply
@@ -218,8 +218,8 @@ def _corner_coordinates(face: Element, lengths: np.ndarray) -> tuple[np.ndarray 
 def _row_colours(element: Element) -> np.ndarray | None:
     """Return the colours (n, 3) of an element's rows as shares of white; None where it has none.
 
-    Whole numbers are shares of the most that their type holds, of 255 where they have 32 bits and none is larger.
-    Fractions beyond 2 are taken as levels up to 255 too, as some programs write them.
+    Whole numbers are shares of the most that their type holds, of MAX_LEVEL where they have 32 bits and none is larger.
+    Fractions beyond MAX_FRACTION are levels up to MAX_LEVEL too, as some programs write them.
     """
     for names in _COLOURS:
         values = element.numbers(*names)
@@ -227,8 +227,8 @@ def _row_colours(element: Element) -> np.ndarray | None:
             kind = element.types[names[0]]
             largest = values.max(initial=0.0)
             if kind.kind == "f":
-                most = 255 if largest > 2 else 1
+                most = MAX_LEVEL if largest > MAX_FRACTION else 1
             else:
-                most = 255 if kind.itemsize >= 4 and largest <= 255 else np.iinfo(kind).max
+                most = MAX_LEVEL if kind.itemsize >= 4 and largest <= MAX_LEVEL else np.iinfo(kind).max
             return np.nan_to_num(values / most)
     return None
