@@ -106,7 +106,7 @@ def _cell(world: TracedScene, column: UInts, packed: UInts, grid: UInts) -> _Cel
 def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *, clip: bool) -> tuple:
     x, y, pitch, step, pixel, aside, down = _cell(world, column, packed, grid)
     ray, aim = camera_rays(world, x + aside * pitch, y + down * pitch)
-    si, transmission, optical, distance = _first_hit(world, ray)
+    si, transmission, optical, distance = first_opaque(world, ray, Bool(True))
     hit = si.is_valid()
     value, to_laser, irradiance, leg = laser_leg(world, si, pixel, hit, seen_by_camera=(transmission, optical))
     normal, point = to_camera(world, si.n), to_camera(world, si.p - world.eye)
@@ -199,15 +199,6 @@ def _refracted_footprints(world: TracedScene, column: UInts, packed: UInts, grid
         glints = _glint(world, si, mi.Ray3f(si.p, bent.direction), -bent.direction, hit, irradiance * passed)
     by_glass = (*(dr.select(hit, part, 0) for part in found), flags, *glints)
     return tuple(dr.select(glass, new, old) for new, old in zip(by_glass, straight, strict=True))
-
-
-def _first_hit(world: TracedScene, ray: Rays) -> tuple[Array, Array, Array, Array]:
-    """Trace `first_opaque` of rays from the camera in the order of their pixels."""
-    if world.sees_through:
-        return first_opaque(world, ray, Bool(True))
-    # neighbouring lanes are neighbouring rays: told so, Embree is three times as fast
-    si = world.mi_scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=Bool(True))
-    return si, Float(1), si.t, si.t
 
 
 def _clip_to_face(

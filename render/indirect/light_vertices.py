@@ -117,7 +117,7 @@ def _sample_vertices(world: TracedScene, index: UInts, each: UInts, *key: UInts)
     sine, cosine = dr.sincos(2 * math.pi * v)
     towards = to_world(world, mi.Vector3f(ring * cosine, ring * sine, 1 - height))
     ray = mi.Ray3f(mi.Point3f(world.laser) + 0 * towards, towards)
-    si, _, _, distance = first_opaque(world, ray, Bool(True))
+    si, _, _, distance = first_opaque(world, ray, Bool(True), scattered=True)
     # a lamp on a wall lights the room, not the wall: shadow rays end before it, too
     touching = si.is_valid() & (distance <= TOUCHING * dr.max(dr.abs(world.laser)))
     beyond, _, _, _ = first_opaque(world, spawn(si, towards), touching, ray.o)
