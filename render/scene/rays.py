@@ -126,13 +126,7 @@ def first_opaque(
 
 @dr.syntax
 def _pass_layers(
-    world: TracedScene,
-    ray: Rays,
-    origin: Vectors,
-    active: Masks,
-    limit: Floats | None,
-    in_air: bool,
-    coherent: bool = False,
+    world: TracedScene, ray: Rays, origin: Vectors, active: Masks, limit: Floats | None, in_air: bool, coherent: bool
 ) -> tuple[Array, ...]:
     """Trace `first_opaque` through layers, no farther than `limit`; where nothing stops the ray the paths run there.
 
