@@ -61,13 +61,14 @@ class Detections(NamedTuple):
 def first_of_each_cycle(events: Detections, sensor: Sensor) -> Detections:
     """Return those that are the first in their pixel and cycle, by pixel and cycle; positions are whole bins, or times
     within the period."""
-    if events.position.dtype.kind == "f":
+    cycles, bins = int(events.cycle.max(initial=0)) + 1, sensor.bins
+    places = (int(events.pixel.max(initial=0)) + 1) * cycles * bins
+    if events.position.dtype.kind == "f" or places >= 1 << 63:  # one number tells every bin of every cycle below that
         order = np.lexsort((events.position, events.cycle, events.pixel))
         pixel, cycle = events.pixel[order], events.cycle[order]
         new = (pixel[1:] != pixel[:-1]) | (cycle[1:] != cycle[:-1])
         first_ones = order[np.concatenate((np.ones(min(1, len(order)), bool), new))]
         return Detections(*(column[first_ones] for column in events))
-    cycles, bins = int(events.cycle.max(initial=0)) + 1, sensor.bins
     place = np.sort((events.pixel.astype(np.int64) * cycles + events.cycle) * bins + events.position)
     group = place // bins
     first = place[np.concatenate(([True], group[1:] != group[:-1]))] if len(place) else place

@@ -20,6 +20,7 @@ from spad.sensor.tdc import Tdc
 
 Reset = Literal["synchronous", "free-running"]
 HOT_RATE_HZ = 1e4  # of hot pixels in a sensor file that gives their share alone, as with `sense --hot-pixels`
+MAX_CYCLES = 1e15  # of an exposure, three years at 10 MHz: every whole number up to there is a float64
 MAX_RATE_HZ = 1e12  # of dark counts: one a picosecond, far above any device; sums over pixels stay finite
 NUMBERS = (  # fields of a sensor that are one number each
     *("bin_width_s", "period_s", "exposure_s", "pde", "hot_share", "hot_rate_hz", "dead_share", "dead_time_s"),
@@ -96,6 +97,8 @@ class Sensor:
             math.isfinite(self.exposure_s) and self.exposure_s >= self.period_s,
             f"{where}: exposure {self.exposure_s:g} s is not finite or shorter than the period {self.period_s:g} s",
         )
+        long = f"{where}: exposure {self.exposure_s:g} s is {self.cycles:.3g} periods of {self.period_s:g} s"
+        require(self.cycles <= MAX_CYCLES, f"{long}, the limit is {MAX_CYCLES:g}")
         self._check_detector(where)
 
     def _normalise(self, where: str) -> None:

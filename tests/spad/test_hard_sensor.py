@@ -177,7 +177,7 @@ def test_some_hot_pixels_are_where_the_seed_puts_them() -> None:
     [
         {"pde": 0.0}, {"pde": 1.5}, {"crosstalk": -0.1}, {"crosstalk": 0.3}, {"hot_share": 2.0}, {"dead_share": -1.0},
         {"reset": "never"}, {"dead_time_s": -1e-9}, {"dead_time_s": float("nan")}, {"dark_count_rate_hz": ()},
-        {"dark_count_rate_hz": (1.0, -1.0)}, {"hot_rate_hz": float("inf")},
+        {"dark_count_rate_hz": (1.0, -1.0)}, {"hot_rate_hz": float("inf")}, {"exposure_s": 1e12}, {"exposure_s": 1e300},
     ],
 )  # fmt: skip
 def test_bad_detectors_are_refused_in_one_line(bad: dict) -> None:

@@ -321,3 +321,11 @@ def test_first_of_each_cycle_keeps_the_earliest() -> None:
     events = Detections(np.array([1, 0, 1, 1, 0]), np.array([3, 0, 3, 4, 0]), np.array([9, 5, 2, 7, 5]))
     first = first_of_each_cycle(events, SMALL)
     assert [tuple(map(int, event)) for event in zip(*first, strict=True)] == [(0, 0, 5), (1, 3, 2), (1, 4, 7)]
+
+
+def test_first_photons_of_months_are_all_photons() -> None:
+    """In 9e14 cycles no two photons meet; the bins of all pixels and cycles together are more than 64 bits count."""
+    sensor, budget = replace(SMALL, exposure_s=9e14 * SMALL.period_s), PhotonBudget(20, 20)
+    row = same(2048, (0.3, 0.3, 1.0))
+    first, every = (sense(row, sensor, budget, seed=5, model=model).counts for model in ("first-photon", "poisson"))
+    assert (first == every).all()
