@@ -19,6 +19,7 @@ CACHE_BYTES = 1 << 20
 # Measured: up to so many time blocks, a table that marks them counts detections faster than a count of each
 MARKED_TIMES = 16
 EXACT_FLOAT = 1 << 24  # float32 holds whole numbers up to here
+LONG_BAG = 1 << 10  # rows that are added in float32, at most
 
 
 def photon_table(weights: Tensor) -> Tensor:
@@ -130,8 +131,21 @@ def _extremes(stamps: Tensor) -> tuple[int, int]:
 
 
 def _bags(index: Tensor, table: Tensor, starts: Tensor) -> Tensor:
-    """Sum table[index] between neighbouring starts, (bags, K)."""
+    """Sum table[index] between neighbouring starts, (bags, K). What float32 rounds away grows with the rows that are
+    added one by one: longer bags than LONG_BAG are summed in parts of that length, and these in float64."""
     starts = starts.to(index.dtype)
+    lengths = starts.diff()
+    if len(index) <= LONG_BAG or int(lengths.max()) <= LONG_BAG:
+        return _sums(index, table, starts)
+    parts = lengths.add(LONG_BAG - 1).div(LONG_BAG, rounding_mode="floor")  # none of an empty bag
+    ends = pad(parts.cumsum(0), (1, 0)).to(index.dtype)
+    part = torch.arange(int(ends[-1]), dtype=index.dtype, device=index.device)
+    first = torch.repeat_interleave(starts[:-1] - LONG_BAG * ends[:-1], parts) + LONG_BAG * part
+    subtotals = _sums(index, table, pad(first, (0, 1), value=len(index)))
+    return _sums(part, subtotals.double(), ends).to(table.dtype)
+
+
+def _sums(index: Tensor, table: Tensor, starts: Tensor) -> Tensor:
     return torch.nn.functional.embedding_bag(index, table, starts, mode="sum", include_last_offset=True)
 
 
