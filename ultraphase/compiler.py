@@ -23,6 +23,7 @@ from ultraphase.chip import ChipSpec, chosen_chip
 from ultraphase.integer_code import IntegerCode, folded_temporal
 from ultraphase.tables import block_matrix, int8_codes, quarter_wave, wave_matrix
 
+_MAX_OUTPUT_SHIFT = 16  # of a block's sum: products of more cores leave the 32 bits of a register
 _EAST, _WEST, _SOUTH, _NORTH = 1, 2, 4, 8  # bits of a core's `ways`, as `sumblock.s` reads them
 
 
@@ -154,6 +155,12 @@ def compile_code(code: IntegerCode, chip: ChipSpec | None = None) -> Compiled:
         return _counters(code, chip)
     cores, folded = code.block[0] * code.block[1], bool(code.harmonics)
     weighted = code.spatial is not None
+    most = 1 << _MAX_OUTPUT_SHIFT - (7 if weighted else 0)
+    blocks = f"blocks of {code.block[0]} x {code.block[1]} cores"
+    require(
+        code.output_shift <= _MAX_OUTPUT_SHIFT,
+        f"code {code.name}: {blocks}, the sum of more than {most:,} leaves 32 bits",
+    )
     ram = layout(code.codes, code.bins, cores, chip, folded=folded, weighted=weighted)
     if ram.total > chip.ram_bytes:
         needs = f"needs {ram.total:,} bytes of RAM a core ({ram}), {chip.ram_bytes:,} are there"
