@@ -3,7 +3,7 @@ one whose photons come far apart."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -14,9 +14,10 @@ from ultraphase.assembly.isa import HALF_LIMITS
 from ultraphase.assembly.program import KINDS, Program
 from ultraphase.catalog import Method
 from ultraphase.chip import ChipSpec
+from ultraphase.compiler import Compiled
 from ultraphase.core import Core
 from ultraphase.products import Tabulated
-from ultraphase.tables import INT8_SCALE, spatial_sum, weighted_sum
+from ultraphase.tables import INT8_SCALE, block_sum, spatial_sum, weighted_sum
 
 LINKS = ("SEND", "RECV")
 _BRIGHT, _PHOTONS = 4, 300  # cores with so many photons; all others have one
@@ -156,3 +157,63 @@ def require_block_end(method: Method, temporal: np.ndarray, seed: int = 0) -> No
         right = spatial_sum(sums_of(stamps), weights.reshape(cores, method.codes)).reshape(1, -1)
         same = np.array_equal(frame.out, right)
         require(same, f"program {program.name}: a block of cores puts out other than the weighted sum of its photons")
+
+
+def require_compiled_end(compiled: Compiled, seed: int = 0) -> None:
+    """Raise InputError unless the end of a frame of a compiled code's block puts out the weighted sum of what its cores
+    hold, in 16 bits a number, and leaves zeros, whatever the registers hold.
+
+    Cores hold random sums; what makes a block's sum as large and as small as it can be; and what makes it the last to
+    be rounded down and the first to be rounded up. These need large and odd weights, so that others than the code's are
+    run, too. A code of single cores `verify` has run to the end.
+    """
+    if compiled.block == (1, 1):
+        return
+    random, tables = np.random.default_rng(seed), compiled.tables(compiled.block)
+    cores, region = compiled.block[0] * compiled.block[1], compiled.program.region("codes")
+    sums = random.integers(*HALF_LIMITS, (cores, region.count), endpoint=True)
+    _require_weighted_sum(compiled, tables, [sums], random)
+    shape, step = (*compiled.block, compiled.code.codes), 1 << compiled.code.output_shift
+    odd, largest = np.ones(shape, np.int64), np.ones(shape, np.int64)
+    if compiled.weights is not None:
+        odd = 2 * random.integers(-INT8_SCALE // 2, INT8_SCALE // 2 + 1, shape) + 1
+        largest = INT8_SCALE * random.choice([-1, 1], shape)
+    for weights in (odd, largest):
+        own = np.tile(weights.reshape(cores, -1), region.count // shape[-1])
+        # sums of the weights' signs, so that no core's takes away from another's
+        ends = [(np.sign(own) * end).clip(*HALF_LIMITS) for end in HALF_LIMITS]
+        changed = {} if compiled.weights is None else {"weight": weights}
+        held = ends if weights is largest else _rounded_sums(own, step, random)
+        _require_weighted_sum(compiled, {**tables, **changed}, held, random)
+
+
+def _rounded_sums(weights: np.ndarray, step: int, random: np.random.Generator) -> list[np.ndarray]:
+    """Make what cores hold, (cores, numbers), so that half a step less 1, and half a step, are left of every weighted
+    sum: the first core, whose weights are odd, makes it so."""
+    found = []
+    inverse = np.array([pow(int(weight), -1, step) for weight in weights[0]])
+    for rest in (step // 2 - 1, step // 2):
+        held = random.integers(*HALF_LIMITS, weights.shape, endpoint=True)
+        left = rest - (held[1:] * weights[1:]).sum(axis=0)
+        held[0] = (left * inverse + step // 2) % step - step // 2
+        found.append(held)
+    return found
+
+
+def _require_weighted_sum(
+    compiled: Compiled, tables: Mapping[str, np.ndarray], every: Sequence[np.ndarray], random: np.random.Generator
+) -> None:
+    """Run an end of a frame for each of what cores hold, (cores, numbers). Raises as `require_compiled_end` does."""
+    program, codes = compiled.program, compiled.code.codes
+    array, region = CoreArray(program, compiled.block, tables, chip=compiled.chip), program.region("codes")
+    cores, zeros, bits = len(array.ram), array.ram.copy(), 8 * KINDS[region.kind].itemsize
+    weights = tables["weight"].reshape(cores, codes) if "weight" in tables else None
+    where = f"program {program.name}: the end of its frame"
+    for held in every:
+        array.ram[:, region.address : region.end] = held.astype(np.int16).view(np.uint8)
+        array.registers[:] = random.integers(-(1 << 31), 1 << 31, array.registers.shape)
+        frame = array.frame(np.zeros(0, np.int64), np.zeros(cores + 1, np.int64))
+        right = block_sum(held.reshape(cores, -1, codes), weights, compiled.code.output_shift).reshape(1, -1)
+        same = np.array_equal(frame.out, right) and bool((frame.out_sizes == bits).all())
+        require(same, f"{where} puts out other than the weighted sum of what a block's cores hold")
+        require(np.array_equal(array.ram, zeros), f"{where} leaves other than zeros")

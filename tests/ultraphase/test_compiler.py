@@ -1,11 +1,15 @@
 """Compiled codes: every timestamp, the frame's end of blocks of cores, and what does not fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scenes.errors import InputError
-from ultraphase import ChipSpec, CoreArray, verify
+from ultraphase import ChipSpec, CoreArray, assemble, verify
+from ultraphase.catalog import FOLDER
 from ultraphase.compiler import compile_code
+from ultraphase.frame_end import require_compiled_end
 from ultraphase.integer_code import IntegerCode, folded_temporal
 from ultraphase.tables import block_sum, coarse_matrix
 
@@ -60,6 +64,34 @@ def test_every_timestamp_adds_its_column(name):
         proof = verify(compiled.program, compiled.matrix[core], of_core(compiled, *core))
         assert (proof.clocks == proof.clocks[0]).all()  # no timestamp takes longer than another
     assert compiled.program.ram_bytes == compiled.layout.total <= 512
+
+
+@pytest.mark.parametrize(
+    "name", ["Fourier + learned", "learned, 16 bins", "full", "a row of three", "a column of three"]
+)
+def test_ends_of_compiled_blocks_are_proved(name):
+    require_compiled_end(compile_code(CODES[name]))
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        ("STH  [place + 0], zero", "MOV  zero, #0", "leaves other than zeros"),
+        ("        MOV  zero, #0\n", "", "leaves other than zeros"),
+        ("#HALF", "#HALF - 1", "puts out other than the weighted sum"),
+        ("#HALF", "#HALF + 1", "puts out other than the weighted sum"),
+        ("OUTH a", "MAX  a, a, #-32000\n        OUTH a", "puts out other than the weighted sum"),
+        ("LDBS b", "LDB  b", "puts out other than the weighted sum"),
+    ],
+)
+def test_wrong_ends_of_compiled_blocks_are_refused(right, wrong, message):
+    """One frame of 550 photons was all that was compared, and the first five put out in it what the right end does."""
+    made, text = compile_code(learned(1, 256, (2, 2))), (FOLDER / "sumblock.s").read_text()
+    changed = made.source.replace('.include "sumblock.s"', text.replace(right, wrong))
+    assert right in text
+    program = assemble(changed, name="wrong", read=lambda name: (FOLDER / name).read_text())
+    with pytest.raises(InputError, match=f"program wrong: the end of its frame {message}"):
+        require_compiled_end(replace(made, program=program))
 
 
 @pytest.mark.parametrize("name", CODES)
@@ -133,6 +165,7 @@ def test_the_fastest_loop_that_the_store_holds_is_taken():
         (fourier((1, 2, 3), 8), r"sums 1,536\), 512 are there; would fit: 6 codes of blocks of 32 bins$"),
         (fourier(tuple(range(1, 16)), 32), r"would fit: 6 codes of 32 bins$"),
         (fourier(tuple(range(1, 32)), 512), r"over the 256 of the core; would fit: 60 codes$"),
+        (learned(1, 64, (32, 32)), r"blocks of 32 x 32 cores, the sum of more than 512 leaves 32 bits$"),
         (learned(2, 48), r"blocks of 48 bins, expected a power of two"),
     ],
 )

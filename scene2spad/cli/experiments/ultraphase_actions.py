@@ -21,7 +21,7 @@ from scenes.progress import Progress
 from ultraphase import Method, Tabulated, listing, method, verify
 from ultraphase.catalog import PUBLISHED
 from ultraphase.chip import ASSUMPTIONS
-from ultraphase.frame_end import require_block_end
+from ultraphase.frame_end import require_block_end, require_compiled_end
 from ultraphase.power import READINGS, Cost, Load, as_csv, measured_cost, power, reference_bits, sweep, table
 
 log = logging.getLogger(__name__)
@@ -145,6 +145,7 @@ def _compile(command: Ultraphase, progress: Progress) -> dict:
     headroom = headroom_of(model) if command.headroom is None else command.headroom
     model = with_headroom(model, headroom) if headroom else model
     compiled = compile_model(model, checkpoint_name(path)).compiled
+    require_compiled_end(compiled)
     cost, text = measured(compiled), listing_with_tables(compiled)
     result = {
         "model": compiled.name,

@@ -21,6 +21,7 @@ from ultraphase import CoreArray
 from ultraphase.catalog import TIMESTAMPS
 from ultraphase.compiler import Compiled
 from ultraphase.core import Counters
+from ultraphase.frame_end import require_compiled_end
 from ultraphase.power import Cost, cost_of
 from ultraphase.verify import Tabulated, verify
 
@@ -75,7 +76,8 @@ class FastCores:
 
     @classmethod
     def of(cls, compiled: Compiled) -> FastCores:
-        """Prove every core's program equal to its integer matrix. Raises InputError where it is not."""
+        """Prove every core's program equal to its integer matrix, and the end of a block's frame to its weighted sum.
+        Raises InputError where it is not."""
         rows, columns = compiled.block
         alike = compiled.code.temporal.ndim == 2
         found: dict[tuple[int, int], Tabulated] = {}
@@ -87,6 +89,7 @@ class FastCores:
                     stays, matrix = compiled.code.counters, compiled.matrix[core]
                     found[core] = verify(compiled.program, matrix, tables, chip=compiled.chip, saturates=stays)
                 found[row, column] = found[core]
+        require_compiled_end(compiled)
         return cls(compiled, tuple(tuple(found[r, c] for c in range(columns)) for r in range(rows)))
 
     def frame(self, counts: np.ndarray) -> tuple[np.ndarray, int]:
