@@ -304,7 +304,7 @@ class CompressiveLayer(nn.Module):
         return blocks.encode_blocks(counts, self.weights())
 
     def core_sums(self, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sums of int8 steps that each pixel's core makes, (B, K, T/Mt, R, C) exact, and the value of a step."""
+        """Return sums of int8 steps of each core, (B, K, T/Mt, R, C) exact below 2^24, and the value of a step."""
         blocks.check_counts(counts, self.block)
         steps, step = self._temporal_steps()
         return blocks.encode_blocks(counts, steps.view(*steps.shape[:2], 1, 1)), step

@@ -19,7 +19,7 @@ CACHE_BYTES = 1 << 20
 # Measured: up to so many time blocks, a table that marks them counts detections faster than a count of each
 MARKED_TIMES = 16
 EXACT_FLOAT = 1 << 24  # float32 holds whole numbers up to here
-LONG_BAG = 1 << 10  # rows that are added in float32, at most
+LONG_BAG = 1 << 10  # rows that are added one by one in float32, at most
 
 
 def photon_table(weights: Tensor) -> Tensor:
@@ -140,7 +140,8 @@ def _bags(index: Tensor, table: Tensor, starts: Tensor) -> Tensor:
     parts = lengths.add(LONG_BAG - 1).div(LONG_BAG, rounding_mode="floor")  # none of an empty bag
     ends = pad(parts.cumsum(0), (1, 0)).to(index.dtype)
     part = torch.arange(int(ends[-1]), dtype=index.dtype, device=index.device)
-    first = torch.repeat_interleave(starts[:-1] - LONG_BAG * ends[:-1], parts) + LONG_BAG * part
+    bag = torch.repeat_interleave(torch.arange(len(parts), device=index.device), parts)
+    first = starts[bag] + LONG_BAG * (part - ends[bag])
     subtotals = _sums(index, table, pad(first, (0, 1), value=len(index)))
     return _sums(part, subtotals.double(), ends).to(table.dtype)
 
