@@ -276,7 +276,7 @@ def test_a_set_of_coordinates_that_is_not_there_is_noted(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("attributes", "material", "primitive", "words"),
     [
-        ({"TEXCOORD_0": UV}, transformed(rotation=0.5, texCoord=0), {}, "KHR_texture_transform has a rotation"),
+        ({"TEXCOORD_0": UV}, transformed(rotation="0.5", texCoord=0), {}, "KHR_texture_transform '0.5' is not a"),
         ({}, None, {"mode": 6}, "triangle fan"),
     ],
 )
@@ -318,6 +318,7 @@ def test_a_texture_beyond_the_limit_is_refused(tmp_path: Path, monkeypatch: pyte
     ("name", "way_round"),
     [
         ("EXT_mesh_gpu_instancing", "write its instances out as nodes"),
+        ("KHR_node_visibility", None),
         ("EXT_meshopt_compression", "export it uncompressed"),
         ("KHR_draco_mesh_compression", "export it uncompressed"),
         ("FOO_unknown", "export it without"),

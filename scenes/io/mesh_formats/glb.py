@@ -12,8 +12,8 @@ from scenes.arrays import finite_number
 from scenes.errors import InputError, listed, require
 from scenes.io.inputs import parse_json
 from scenes.io.mesh_formats import NotReadError
-from scenes.io.mesh_formats.glb_coordinates import plain_coordinates
-from scenes.io.mesh_formats.glb_nodes import plain_nodes
+from scenes.io.mesh_formats.glb_coordinates import dense_accessors, plain_coordinates
+from scenes.io.mesh_formats.glb_nodes import VISIBILITY, plain_nodes
 from scenes.io.textures import WHITE, Colour, check_checksums
 from scenes.json_types import JsonObject
 
@@ -27,14 +27,16 @@ _NEAREST = 9728
 _WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 
 # Extensions that files may need and are read; what is taken off a material changes no shape.
-_READ = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp")
+_READ = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", VISIBILITY)
 _READ_MATERIALS = "KHR_materials_pbrSpecularGlossiness"
 _LOOKS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "EXT_lights_", "EXT_materials_")  # how their names begin
 _CLEAR = ("KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_diffuse_transmission")
 _INSTANCES = "EXT_mesh_gpu_instancing"
+_PACKED = {"EXT_meshopt_compression", "KHR_meshopt_compression"}
 _WAYS_ROUND = {
     _INSTANCES: "write its instances out as nodes",
     "EXT_meshopt_compression": "export it uncompressed",
+    "KHR_meshopt_compression": "export it uncompressed",
     "KHR_draco_mesh_compression": "export it uncompressed",
     "KHR_texture_basisu": "export its textures as .png or .jpg",
 }
@@ -51,7 +53,7 @@ def check_glb(content: bytes, read: ReadImage) -> None:
     _check_indices(header)
     try:
         _check_extensions(header)
-        _check_accessors(header, len(content))
+        _check_accessors(header, binary, len(content))
         for mesh in header.get("meshes", []):
             for primitive in mesh["primitives"]:
                 fan = primitive.get("mode", 4) == 6
@@ -78,7 +80,7 @@ def glb_notes(content: bytes) -> list[str]:
     """Return what is left out of a sound GLB: nodes, poses, instances, clear surfaces and other looks, metal and glow,
     and how its textures are sampled."""
     header, binary = _glb_chunks(content)
-    notes = plain_nodes(header, binary)
+    notes = plain_nodes(header, dense_accessors(header, binary))
     several = sum(_INSTANCES in node.get("extensions", {}) for node in header.get("nodes", []))
     if several:
         notes.append(f"{_INSTANCES} is left out: each of {several} nodes is there once")
@@ -177,29 +179,43 @@ def _entries(value: object) -> Iterator[tuple[str, object]]:
             pending.extend(one)
 
 
-def _check_accessors(header: JsonObject, size: int) -> None:
-    """InputError where primitives read what has no data of its own, or accessors declare more than the file has."""
+def _check_accessors(header: JsonObject, binary: bytes, size: int) -> None:
+    """InputError where primitives read what has no data of its own, or accessors declare more than the file has.
+
+    Sparse ones are made dense here, as they will be read.
+    """
     accessors = header.get("accessors", [])
+    for number, accessor in enumerate(accessors):
+        fits = ("bufferView" in accessor and "sparse" not in accessor) or accessor["count"] <= size
+        require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
+    dense_accessors(header, binary)
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"]]
     used = [[*one["attributes"].values(), *([one["indices"]] if "indices" in one else [])] for one in primitives]
     read = {number for numbers in used for number in numbers}
     for number, accessor in enumerate(accessors):
-        held = "bufferView" in accessor and "sparse" not in accessor
-        message = f"accessor {number} is sparse or compressed, which is not read; export it uncompressed"
-        require(held or number not in read, message)
-        fits = held or accessor["count"] <= size
-        require(fits, f"accessor {number} declares {accessor['count']} elements in a file of {size} bytes")
+        if number not in read:
+            continue
+        message = f"accessor {number} has no numbers in a buffer, as of compressed files; export it uncompressed"
+        require("bufferView" in accessor, message)
+        if "sparse" in accessor:
+            raise NotReadError(f"accessor {number} is sparse with numbers in another file; export it as one .glb")
+        view = header["bufferViews"][accessor["bufferView"]]
+        packed = _PACKED & view.get("extensions", {}).keys()
+        if packed and view["buffer"] > 0 and "uri" not in header["buffers"][view["buffer"]]:
+            message = f"accessor {number} is compressed by {min(packed)}, which is not read; export it uncompressed"
+            raise NotReadError(message)
 
 
 def plain_glb(content: bytes) -> bytes:
-    """Return a GLB as trimesh reads it rightly: nodes as in `plain_nodes`, coordinates as in `plain_coordinates`,
-    materials named by their numbers, and vertex colours of more than 8 bits with a material.
+    """Return a GLB as trimesh reads it rightly: no sparse accessors, nodes as in `plain_nodes`, coordinates as in
+    `plain_coordinates`, materials named by their numbers, and vertex colours of more than 8 bits with a material.
 
     trimesh keeps such colours as they are only beside a material.
     """
     header, binary = _glb_chunks(content)
-    made = plain_coordinates(header, binary)
-    plain_nodes(header, binary)
+    dense = dense_accessors(header, binary)
+    made = plain_coordinates(header, dense)
+    plain_nodes(header, dense)
     header["materials"] = [{**one, "name": str(number)} for number, one in enumerate(header.get("materials", []))]
     primitives = [one for mesh in header.get("meshes", []) for one in mesh["primitives"] if "material" not in one]
     colours = [(one, one["attributes"].get("COLOR_0")) for one in primitives]

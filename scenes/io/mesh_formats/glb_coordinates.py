@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from scenes.arrays import finite_number
 from scenes.errors import require
 from scenes.io.mesh_formats import NotReadError
 from scenes.json_types import JsonObject
@@ -20,7 +23,7 @@ def plain_coordinates(header: JsonObject, binary: bytes) -> bytes:
     - Positions that are normalized whole numbers are floats.
     - Texture coordinates of the base colour are floats, the first set, and moved by their KHR_texture_transform.
 
-    Raises NotReadError where that is not so simple: numbers in another file, or a transform that turns a texture.
+    Raises NotReadError where that is not so simple: numbers in another file.
     """
     made = bytearray(binary)
     for primitive in [one for mesh in header.get("meshes", []) for one in mesh["primitives"]]:
@@ -50,14 +53,46 @@ def _move_coordinates(
     if name not in attributes:
         attributes.pop("TEXCOORD_0", None)
         return
-    # programs turn it in one sense, the extension's own example in the other
-    require(moved.get("rotation", 0) == 0, f"a base colour's {_TRANSFORM} has a rotation, bake it into the coordinates")
     offset, scale = np.array(moved.get("offset", (0, 0)), float), np.array(moved.get("scale", (1, 1)), float)
-    still = [*offset, *scale] == [0, 0, 1, 1]
+    angle = finite_number(moved.get("rotation", 0), f"the rotation of a base colour's {_TRANSFORM}")
+    still = [*offset, *scale, angle] == [0, 0, 1, 1, 0]
     if still and name == "TEXCOORD_0" and header["accessors"][attributes[name]]["componentType"] == FLOAT:
         return
-    uv = offset + scale * _held_numbers(header, binary, attributes[name])
+    # counter-clockwise as an image is seen, whose v runs down; first scaled, then turned, then moved
+    turn = np.array(((math.cos(angle), math.sin(angle)), (-math.sin(angle), math.cos(angle))))
+    uv = offset + (scale * _held_numbers(header, binary, attributes[name])) @ turn.T
     attributes["TEXCOORD_0"] = _appended(header, made, uv)
+
+
+def dense_accessors(header: JsonObject, binary: bytes) -> bytes:
+    """Make accessors of a GLB that are sparse plain ones, as trimesh reads; return its binary chunk with their numbers.
+
+    Ones in another file stay as they are. Raises InputError where one is cut short, or replaces what is not there.
+    """
+    made = bytearray(binary)
+    for number, accessor in enumerate(header.get("accessors", [])):
+        if "sparse" not in accessor:
+            continue
+        count, width = accessor["count"], _WIDTHS[accessor["type"]]
+        sparse = accessor["sparse"]
+        parts = {**sparse["indices"], "type": "SCALAR"}, {**accessor, "byteOffset": 0, **sparse["values"]}
+        where = f"the {sparse['count']} sparse numbers of accessor {number}"
+        places, values = (_elements(header, binary, {**one, "count": sparse["count"]}, where) for one in parts)
+        base = None
+        if "bufferView" in accessor:
+            base = _elements(header, binary, accessor, f"accessor {number}")
+        if places is None or values is None or ("bufferView" in accessor and base is None):
+            continue
+        rows = np.zeros((count, width), values.dtype) if base is None else base.copy()
+        require(places.dtype.kind == "u" and int(places.max()) < count, f"{where} reach beyond its {count} elements")
+        rows[places[:, 0]] = values
+        plain = _appended(header, made, rows)
+        kept = {key: value for key, value in accessor.items() if key not in ("sparse", "byteOffset")}
+        header["accessors"][number] = kept | {"bufferView": header["accessors"].pop(plain)["bufferView"]}
+    if len(made) > len(binary):
+        made += bytes(-len(made) % 4)
+        header["buffers"][0]["byteLength"] = len(made)
+    return bytes(made)
 
 
 def accessor_numbers(header: JsonObject, binary: bytes, number: int) -> np.ndarray | None:
@@ -66,6 +101,15 @@ def accessor_numbers(header: JsonObject, binary: bytes, number: int) -> np.ndarr
     accessor = header["accessors"][number]
     if "bufferView" not in accessor or "sparse" in accessor:
         return None
+    found = _elements(header, binary, accessor, f"accessor {number}")
+    if found is None:
+        return None
+    kind, values = found.dtype, found.astype(np.float64)
+    return np.maximum(values / np.iinfo(kind).max, -1) if accessor.get("normalized") and kind.kind != "f" else values
+
+
+def _elements(header: JsonObject, binary: bytes, accessor: JsonObject, where: str) -> np.ndarray | None:
+    """Return the numbers (count, width) of an accessor's buffer view as they are stored; None of another file."""
     view = header["bufferViews"][accessor["bufferView"]]
     if view.get("buffer", 0) != 0 or "uri" in header["buffers"][0]:
         return None
@@ -74,10 +118,9 @@ def accessor_numbers(header: JsonObject, binary: bytes, number: int) -> np.ndarr
     step = view.get("byteStride", size)
     require(
         count > 0 and step >= size and start + step * (count - 1) + size <= len(binary),
-        f"accessor {number} is cut short",
+        f"{where} is cut short",
     )
-    values = np.ndarray((count, width), kind, binary, start, (step, kind.itemsize)).astype(np.float64)
-    return np.maximum(values / np.iinfo(kind).max, -1) if accessor.get("normalized") and kind.kind != "f" else values
+    return np.ndarray((count, width), kind, binary, start, (step, kind.itemsize))
 
 
 def _held_numbers(header: JsonObject, binary: bytes, number: int) -> np.ndarray:
@@ -90,7 +133,7 @@ def _held_numbers(header: JsonObject, binary: bytes, number: int) -> np.ndarray:
 def _appended(header: JsonObject, made: bytearray, values: np.ndarray) -> int:
     """Put numbers (count, width) behind a binary chunk as an accessor, whose number is returned."""
     made += bytes(-len(made) % 4)
-    content = values.astype("<f4").tobytes()
+    content = (values.astype("<f4") if values.dtype == np.float64 else values).tobytes()
     header["bufferViews"].append({"buffer": 0, "byteOffset": len(made), "byteLength": len(content)})
     made += content
     view, kind = len(header["bufferViews"]) - 1, f"VEC{values.shape[1]}"

@@ -1,4 +1,5 @@
-"""Put the nodes of a GLB as trimesh reads them rightly: primitives, skins, and nodes that are scaled to nothing."""
+"""Put the nodes of a GLB as trimesh reads them rightly: primitives, skins, and nodes that are invisible, or scaled to
+nothing."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from scenes.io.mesh_formats import NotReadError
 from scenes.io.mesh_formats.glb_coordinates import FLOAT, accessor_numbers
 from scenes.json_types import JsonObject
 
+VISIBILITY = "KHR_node_visibility"
 _FLAT = 1e-9  # shortest to longest axis of a unit sphere under a transform, below which a body is squashed flat
 _ALIKE = 1e-5  # relative difference of joints' transforms: inverse bind matrices are in single precision
 
@@ -19,13 +21,15 @@ def plain_nodes(header: JsonObject, binary: bytes) -> list[str]:
     - Every primitive has a node of its own, named by its number: trimesh names it by chance.
     - Cameras go: trimesh drops the mesh of a node that has one, and what hangs below it.
     - A mesh with a skin stands where its joints place it, not where its own node does (glTF 2.0, 3.7.3.3).
-    - A mesh that is scaled to nothing, as files hide one, is left out.
+    - A mesh that is scaled to nothing, as files hide one, is left out, and one of a node that is invisible or hangs
+      below an invisible one.
 
     Raises NotReadError where nothing is left then.
     """
     nodes, meshes = header.get("nodes", []), header.get("meshes", [])
     shown, worlds = _worlds(header)
-    hidden, posed, morphed = [], [], []
+    invisible = _invisible(nodes)
+    hidden, unseen, posed, morphed = [], [], [], []
     parts: dict[int, list[int]] = {}
     for number in shown:
         node = nodes[number]
@@ -33,6 +37,10 @@ def plain_nodes(header: JsonObject, binary: bytes) -> list[str]:
         if "mesh" not in node:
             continue
         label, mesh = str(node.get("name", number)), meshes[node["mesh"]]
+        if number in invisible:
+            unseen.append(label)
+            del node["mesh"]
+            continue
         world = worlds[number]
         if "skin" in node:
             world, alike = _skin(header, binary, node["skin"], worlds)
@@ -47,14 +55,32 @@ def plain_nodes(header: JsonObject, binary: bytes) -> list[str]:
         if "skin" in node:
             node = _lifted(header, node, label, world)
         _split(header, node, label, parts)
-    if hidden and not parts:
-        raise NotReadError(f"all its meshes are scaled to nothing by their nodes: {listed(hidden)}")
+    if (hidden or unseen) and not parts:
+        how = " or ".join(["scaled to nothing by their nodes"] * bool(hidden) + ["invisible"] * bool(unseen))
+        raise NotReadError(f"all its meshes are {how}: {listed(hidden + unseen)}")
     lines = (
+        (f"invisible by {VISIBILITY} and left out", unseen),
         ("scaled to nothing by their nodes and left out", hidden),
         ("the pose of a skin is left out, the first joint alone places the mesh", posed),
         ("morph targets are left out, meshes are as without", morphed),
     )
     return [f"{words}: {listed(names)}" for words, names in lines if names]
+
+
+def _invisible(nodes: list[JsonObject]) -> set[int]:
+    """Return the numbers of the nodes that are invisible: those that say so, and all that hang below them."""
+    pending = [number for number, node in enumerate(nodes) if _says_invisible(node)]
+    found: set[int] = set()
+    while pending:
+        number = pending.pop()
+        if number not in found:
+            found.add(number)
+            pending += nodes[number].get("children", [])
+    return found
+
+
+def _says_invisible(node: JsonObject) -> bool:
+    return node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True) is False
 
 
 def _worlds(header: JsonObject) -> tuple[list[int], dict[int, np.ndarray]]:
