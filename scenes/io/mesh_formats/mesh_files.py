@@ -3,10 +3,12 @@ their folder."""
 
 from __future__ import annotations
 
+import codecs
 import io
 import logging
 import re
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote
@@ -111,6 +113,8 @@ def load_trimesh(path: Path, kind: str, **options: bool) -> trimesh.Scene:
 def check_kind(content: bytes, kind: str) -> None:
     """Raise InputError for a file that is empty, or holds another kind of mesh than its extension says."""
     require(bool(content.strip()), "the file is empty")
+    wide = kind == ".obj" and content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    require(not wide, "is text of 16 bits a letter (UTF-16), expected UTF-8; save it so")
     actual = next((ext for magic, ext in MAGIC.items() if content.startswith(magic)), kind)
     require(actual == kind, f"holds {actual} data, its extension says {kind}; rename it")
 
@@ -181,19 +185,30 @@ def read_material_library(path: Path, notes: list[str]) -> dict[str, MaterialEnt
 
 def _note_undefined(text: str, entries: dict[str, MaterialEntry], notes: list[str]) -> None:
     """Note the names of an OBJ's usemtl lines that no material file defines: such faces have no material."""
-    used = re.findall(r"^ *usemtl +(.*?) *$", text.replace("\t", " ").replace("\r", "\n"), re.MULTILINE)
+    lines = text.replace("\t", " ").replace("\r", "\n")
+    used = re.findall(r"^ *usemtl +(.*?) *$", lines, re.MULTILINE | re.IGNORECASE)
+    used = [_without_comment(name, entries) for name in used]
     undefined = [name for name in dict.fromkeys(used) if name and name not in entries]
     if undefined:
         notes.append(f"usemtl names what no material file defines: {listed(undefined)}")
 
 
+def _without_comment(name: str, known: Collection[str]) -> str:
+    """Return a name without the comment behind it, where that makes a known one of it: names may hold a #, too."""
+    bare = name.partition(" #")[0].strip()
+    return bare if name not in known and bare in known else name
+
+
 def _library_names(text: str, folder: Path) -> list[str]:
     """Return the material files that an OBJ names: a line is one name with blanks in it, or several names."""
-    lines = [line.split(maxsplit=1) for line in map(str.strip, text.splitlines()) if line.startswith("mtllib")]
+    lines = re.findall(r"^[ \t]*mtllib[ \t]+([^\r\n]*)", text.replace("\r", "\n"), re.MULTILINE | re.IGNORECASE)
     found: dict[str, None] = {}
-    for words in lines:
-        if len(words) == 2 and words[0] == "mtllib":
-            whole, names = words[1].strip(), words[1].split()
+    for line in lines:
+        whole = line.strip()
+        if " #" in whole and not (folder / whole).exists():
+            whole = whole.partition(" #")[0].strip()
+        if whole:
+            names = whole.split()
             several = not (folder / whole).exists() and all(name.lower().endswith(".mtl") for name in names)
             found |= dict.fromkeys(names if several else [whole])
     return list(found)
@@ -210,5 +225,13 @@ def _with_one_library(content: bytes, beside: _Beside) -> bytes:
     there = [name for name in names if (beside.folder / name.replace("\\", "/")).exists()]
     lines = [line.strip() for name in there for line in without_mark(beside.get(name)).splitlines()]
     beside.textured = any(line.lower().startswith(b"map_kd") for line in lines)
-    beside.made["all.mtl"] = b"\n".join(line for line in lines if line.lower().startswith(b"newmtl"))
+    made = [line for line in lines if line.lower().startswith(b"newmtl")]
+    beside.made["all.mtl"] = b"\n".join(b"newmtl" + line[6:] for line in made)
+    if b"\nusemtl" in content and re.search(rb"^usemtl.* #", content, re.MULTILINE):
+        known = {" ".join(line[6:].decode("utf-8", errors="replace").split()) for line in made}
+
+        def bare(name: re.Match[bytes]) -> bytes:
+            return b"usemtl " + _without_comment(name[1].decode().strip(), known).encode()
+
+        content = re.sub(rb"^usemtl +(.* #.*)", bare, content, flags=re.MULTILINE)
     return b"mtllib all.mtl\n" + re.sub(rb"^mtllib.*", b"", content, flags=re.MULTILINE)

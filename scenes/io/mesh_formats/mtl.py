@@ -153,11 +153,18 @@ def _map_kd(library: Path, name: str, text: str, notes: list[str]) -> Path:
                 notes.append(f"material {name}: option {option} {' '.join(given)} of map_Kd is left out")
         else:
             notes.append(f"material {name}: option {option} of map_Kd is left out")
-            rest = rest.split()[-1]
+            rest = _named_file(library.parent, rest)
     try:
         return file_inside(library.parent, rest, f"texture of material {name}")
     except InputError as error:
         raise InputError(f"{library}: {error}") from None
+
+
+def _named_file(folder: Path, text: str) -> str:
+    """Return the name of a file behind an option of unknown length: the longest one that is there, or the last word."""
+    words = text.split(" ")
+    names = [" ".join(words[start:]) for start in range(1, len(words))]
+    return next((name for name in names if name.strip() and (folder / name).is_file()), text.split()[-1])
 
 
 def _leading_numbers(text: str) -> tuple[list[float], str]:

@@ -7,13 +7,15 @@ import re
 from scenes.errors import require
 from scenes.io.mesh_formats import MAX_FRACTION, MAX_LEVEL
 
+_CAPITALS = re.compile(rb"(?:^|\n)(?:[A-Z]|use[A-Z]|mtl[A-Z])")  # at the beginning of a keyword, or within one
 _DIGITS = bytes.maketrans(b"023456789", b"111111111")
 # by whether they have texture coordinates and normals
 _CORNERS = {(False, False): b"1", (True, False): b"1/1", (False, True): b"1//1", (True, True): b"1/1/1"}
 
 
 def plain_obj(content: bytes) -> bytes:
-    """Return an OBJ as trimesh reads it rightly: no indents, tabs and comments, indices from the first vertex on.
+    """Return an OBJ as trimesh reads it rightly: no indents, tabs and comments, indices from the first vertex on,
+    keywords in small letters.
 
     Lines end by LF, CR LF or CR.
 
@@ -24,9 +26,11 @@ def plain_obj(content: bytes) -> bytes:
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").replace(b"\\\n", b" ").replace(b"\t", b" ")
     if content[:1] in b" #" or b"\n " in content or re.search(rb"\n#.*(?:mtllib|usemtl)", content):
         content = re.sub(rb"^ *#.*(?:mtllib|usemtl).*|^ +", b"", content, flags=re.MULTILINE)
+    if _CAPITALS.search(content):
+        content = re.sub(rb"^[A-Za-z]+(?= )", lambda key: key[0].lower(), content, flags=re.MULTILINE)
     if re.search(rb"^[fv].*#", content, re.MULTILINE):
         content = re.sub(rb"^((?:f|v|vt|vn) [^#\n]*)#.*", rb"\1", content, flags=re.MULTILINE)
-    if re.search(rb"\nf[^-\n]*[ /]-|\nf.*? 0+(?=[ /\n]|$)", content) is None:
+    if re.search(rb"\nf[^-\n]*[ /]-|\nf.*? 0+(?=[ /\n]|$)", content) is None and content[:1] != b"f":
         return content
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
     lines = content.split(b"\n")
@@ -54,7 +58,7 @@ def _corner(corner: bytes, counts: list[int], line: int) -> bytes:
 
 def has_colours(content: bytes) -> bool:
     """Return whether the first vertex of an OBJ has a colour behind its place, as those of many programs have."""
-    first = re.search(rb"(?:^|[\r\n])[ \t]*v[ \t]([^#\r\n]*)", content)
+    first = re.search(rb"(?:^|[\r\n])[ \t]*[vV][ \t]([^#\r\n]*)", content)
     return first is not None and len(first[1].split()) >= 6
 
 
@@ -69,16 +73,45 @@ def plain_colours(content: bytes, textured: bool) -> bytes:
     if not has_colours(content):
         return content
     vertices = [line.split() for line in re.findall(rb"^v +.*", content, re.MULTILINE)]
+    first = 5 if _has_weights(vertices) else 4  # of the colours
+    colours = {word for words in vertices for word in words[first : first + 3]}  # each is read once
     try:
-        levels = max(max(map(float, words[4:7]), default=0.0) for words in vertices) > MAX_FRACTION
+        levels = max(map(float, colours), default=0.0) > MAX_FRACTION
     except ValueError:
         return content  # is told elsewhere
-    if levels:
-        scaled = iter([words[:4] + [b"%.9g" % (float(word) / MAX_LEVEL) for word in words[4:7]] for words in vertices])
-        content = re.sub(rb"^v +.*", lambda _: b" ".join(next(scaled)), content, flags=re.MULTILINE)
+    if levels or first > 4:
+        plain = {word: b"%.9g" % (float(word) / MAX_LEVEL) if levels else word for word in colours}
+        found = iter(vertices)
+
+        def line(_: re.Match[bytes]) -> bytes:
+            words = next(found)
+            return b" ".join((*words[:4], *map(plain.__getitem__, words[first : first + 3])))
+
+        content = re.sub(rb"^v +.*", line, content, flags=re.MULTILINE)
     if textured:
         return content
-    return re.sub(rb"^f .*/.*", lambda face: _cut_to((False, True), face[0]), content, flags=re.MULTILINE)
+    return re.sub(rb"(?:^f .*\n?){1,1000}", lambda faces: _without_coordinates(faces[0]), content, flags=re.MULTILINE)
+
+
+def _has_weights(vertices: list[list[bytes]]) -> bool:
+    """Return whether vertices have a weight of 1 before their colours: x y z 1 r g b, not x y z r g b alpha."""
+    if any(len(words) != 8 for words in vertices):
+        return False
+    fourth, last = ({words[place] for words in vertices} for place in (4, 7))
+    return _are_ones(fourth) and not _are_ones(last)
+
+
+def _are_ones(words: set[bytes]) -> bool:
+    try:
+        return {float(word) for word in words} == {1.0}
+    except ValueError:
+        return False
+
+
+def _without_coordinates(faces: bytes) -> bytes:
+    """Return lines of faces whose corners have no texture coordinates: a/b/c is a//c, a/b is a."""
+    faces = re.sub(rb"/[^/ \n]+/", b"//", faces)
+    return re.sub(rb"(?<=[^/ \n])/(?:[^/ \n]*|/)(?=[ \n]|$)", b"", faces)
 
 
 def alike_obj(content: bytes) -> tuple[bytes, bool]:
@@ -150,7 +183,7 @@ def _cut_to(kind: tuple[bool, bool], face: bytes) -> bytes:
 def obj_fault(content: bytes) -> str:
     """Return what is wrong with the first line that trimesh cannot read: a vertex or face, with its number; or ""."""
     lines = content.splitlines()
-    keys = [line.split(maxsplit=1)[0] if line.strip() else b"" for line in lines]
+    keys = [line.split(maxsplit=1)[0].lower() if line.strip() else b"" for line in lines]
     counts = [keys.count(key) for key in (b"v", b"vt", b"vn")]
     for number, (key, line) in enumerate(zip(keys, lines, strict=True), start=1):
         words = line.partition(b"#")[0].rstrip(b" \t\\").split()[1:]
