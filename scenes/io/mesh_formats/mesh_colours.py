@@ -98,8 +98,10 @@ class Paint:
             return found
         if found is None:
             found = DEFAULT_ALBEDO
-            other = "no other" if self.has_colours else "no"
-            self.notes.append(f"{part.name}: {other} colour in the file, albedo {found:g}")
+            what = "no other colour in the file" if self.has_colours else "no colour in the file"
+            if part.coloured == "some faces":
+                what = "its colours of some faces are left out"
+            self.notes.append(f"{part.name}: {what}, albedo {found:g}")
         value = round(min(max(float(found), 0.0), 1.0), 9)
         return value, lambda: value
 

@@ -22,7 +22,7 @@ from scenes.io.mesh_formats.glb import check_glb, plain_glb
 from scenes.io.mesh_formats.mtl import MaterialEntry, lenient_text, read_library, without_mark
 from scenes.io.mesh_formats.obj import alike_obj, obj_fault, plain_colours, plain_obj
 from scenes.io.mesh_formats.polygons import without_dents
-from scenes.io.mesh_formats.stl import check_stl
+from scenes.io.mesh_formats.stl import plain_stl
 
 if TYPE_CHECKING:
     import trimesh
@@ -126,7 +126,7 @@ def _checked(content: bytes, kind: str, beside: _Beside) -> tuple[bytes, int | N
     try:
         match kind:
             case ".stl":
-                return content, check_stl(content)
+                return plain_stl(content)
             case ".glb":
                 check_glb(content, beside.get)
                 content = plain_glb(content)

@@ -21,7 +21,7 @@ from scenes.io.mesh_formats.glb import glb_notes
 from scenes.io.mesh_formats.mesh_colours import Paint, Part
 from scenes.io.mesh_formats.mesh_files import MAX_COORDINATE, check_vertices, load_trimesh
 from scenes.io.mesh_formats.ply_meshes import load_ply
-from scenes.io.mesh_formats.stl import STL_HEADER, stl_colours
+from scenes.io.mesh_formats.stl import STL_HEADER, has_some_colours, stl_colours
 from scenes.model import Camera, Material, Scene, Surface
 from scenes.placing import AS_IT_IS, Placing
 
@@ -196,7 +196,9 @@ def _part(mesh: trimesh.Trimesh, pose: np.ndarray, name: str, header: bytes) -> 
     vertices = shapes.transform(vertices, pose)
     colours, coloured = beside.vertex_attributes.get("color"), "vertex"
     if "stl" in mesh.face_attributes:
-        colours, coloured = stl_colours(header, mesh.face_attributes["stl"]), "face"
+        attributes = mesh.face_attributes["stl"]
+        coloured = "some faces" if has_some_colours(header, attributes) else "face"
+        colours = stl_colours(header, attributes)
     return Part(name, vertices, faces, uv, normals, mesh.visual, colours, coloured, as_read=(vertices, faces))
 
 

@@ -7,25 +7,32 @@ import struct
 
 import numpy as np
 
-from scenes.errors import require
+from scenes.errors import InputError, require
 
 STL_HEADER = 80  # bytes before the number of triangles
 _STL_START, _STL_TRIANGLE = 84, 50
 
 
-def check_stl(content: bytes) -> int:
-    """Return the number of triangles of an STL, binary or text. InputError for one that was cut."""
+def plain_stl(content: bytes) -> tuple[bytes, int]:
+    """Return an STL as trimesh reads it rightly, and its number of triangles. InputError for one that was cut.
+
+    A text begins at its first solid, and its lines end by LF.
+    """
     if len(content) >= _STL_START:
         count = struct.unpack_from("<I", content, STL_HEADER)[0]
         expected = _STL_START + count * _STL_TRIANGLE
         if len(content) == expected:
-            return count
-        text = content.lstrip()[:5].lower() == b"solid" and b"facet" in content[:4096].lower()
+            return content, count
         message = f"cut short or damaged: its header says {count} triangles in {expected} bytes, it has {len(content)}"
         if len(content) > expected:
             message = f"{len(content) - expected} bytes after the last of the {count} triangles that its header says"
-        require(text, message)
-    return _check_stl_text(content.lower())
+        require(b"\0" not in content, message)
+    text = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    start = re.search(rb"^[ \t]*solid\b", text, re.MULTILINE | re.IGNORECASE)
+    if start is None:
+        raise InputError("is no STL: neither binary, nor text with a line that begins with solid")
+    text = text[start.start() :]
+    return text, _check_stl_text(text.lower())
 
 
 def _check_stl_text(text: bytes) -> int:
@@ -53,3 +60,8 @@ def stl_colours(header: bytes, attributes: np.ndarray) -> np.ndarray | None:
         whole = flagged | (not attributes.any())
         return np.where(whole[:, None], np.frombuffer(body, np.uint8) / 255, fives / 31)
     return fives[:, ::-1] / 31 if flagged.all() else None
+
+
+def has_some_colours(header: bytes, attributes: np.ndarray) -> bool:
+    """Return whether a binary STL has colours of some faces alone, of which `stl_colours` gives none."""
+    return stl_colours(header, attributes) is None and bool((attributes >> 15 == 1).any())
