@@ -154,15 +154,19 @@ def _check_words(argv: list[str]) -> None:
 
 
 def _check_given_once(name: str, words: list[str]) -> None:
-    """Raise InputError for an option that stands twice: the parser would take the last one's values alone."""
+    """Raise InputError for an option that stands twice, of which the parser would take the last one's values alone, and
+    for one without a value that would change nothing."""
     given: set[str] = set()
-    lists = {_option(one.name) for one in fields(options_of(name)) if "..." in str(one.type)}
-    for word in words:
+    lists = {_option(one.name): one.default for one in fields(options_of(name)) if "..." in str(one.type)}
+    for word, following in zip(words, [*words, "--"][1:], strict=True):
         option = word.partition("=")[0].replace("_", "-")
         if option.startswith("--") and option != "--help":
             hint = f"; write all its values behind one {option}" if option in lists else ", expected once"
             require(option not in given, f"{name}: {option} is given twice{hint}")
             given.add(option)
+            # with a default of its own, none is an answer: no baselines
+            without = lists.get(option) == () and "=" not in word and following.startswith("--")
+            require(not without, f"{name}: {option} has no value; is a variable of the shell unset?")
 
 
 def option_words(name: str) -> set[str]:

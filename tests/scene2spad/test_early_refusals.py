@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import sys
 from contextlib import contextmanager
@@ -48,6 +49,30 @@ def test_absurd_sizes_are_refused_before_any_work(tmp_path, capsys, monkeypatch,
     assert main([*argv, "--out", str(tmp_path / "out")]) == 2
     message = capsys.readouterr().err
     assert why in message and message.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("stage", ["render", "sense", "encode", "network", "emulate", "hard-cases"])
+def test_a_bench_below_a_file_is_refused_before_it_measures(tmp_path, capsys, monkeypatch, stage):
+    """It measured for minutes first, and then had no folder for its table."""
+    (tmp_path / "notes.txt").write_text("mine")
+    monkeypatch.setattr("importlib.import_module", lambda name, real=importlib.import_module: _no_bench(name, real))
+    assert main(["bench", stage, "--out", str(tmp_path / "notes.txt" / "bench")]) == 2
+    assert "notes.txt is a file, expected a folder" in capsys.readouterr().err
+
+
+def _no_bench(name, real):
+    assert not name.startswith("scene2spad.bench"), "work was begun"
+    return real(name)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["bench", "hard-cases", "--only"], ["bench", "--sizes", "--quick"], ["study", "tensors", "--checkpoints"]],
+)
+def test_a_list_without_a_value_is_refused(capsys, words):
+    """Such as of an unset variable of the shell: all of them had been meant."""
+    assert main(words) == 2
+    assert "has no value; is a variable of the shell unset?" in capsys.readouterr().err
 
 
 def test_a_run_that_has_no_place_is_refused_before_its_sets_are_read(tmp_path, capsys, monkeypatch):

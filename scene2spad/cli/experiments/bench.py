@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 
+from scene2spad.cli.paths import output_folder
 from scene2spad.options.common import only_for
 from scene2spad.options.experiments import MIN_SENSE_REPEATS, STAGES_OF, Bench
 from scenes.errors import InputError
@@ -15,6 +16,7 @@ def run(command: Bench, progress: Progress) -> dict:
     for name, value in (("seeds", command.seeds), ("repeats", command.repeats)):
         if not 1 <= value <= 1000:
             raise InputError(f"bench: {name} {value} is outside 1 to 1000")
+    output_folder(command.out, "the results")
     stage = command.stage
     if stage == "sense" and command.repeats < MIN_SENSE_REPEATS:
         raise InputError(f"bench sense: --repeats {command.repeats} is below {MIN_SENSE_REPEATS}")
