@@ -78,9 +78,16 @@ def kind_of(path: Path) -> str:
     kinds = BY_SUFFIX.get(input_file(path).suffix.lower(), ())
     unsealed = path.suffix.lower() == ".mat"
     found = next((kind for kind in kinds if kind not in SEALED or unsealed or holds_kind(path, kind)), None)
+    require(path.stat().st_size > 0, f"{path}: the file is empty")
     if found is None:
         raise InputError(f"{path}: expected {KNOWN}")
+    require(path.suffix.lower() not in HDF5_SUFFIXES or _is_hdf5(path), f"{path}: is no HDF5 file, expected {KNOWN}")
     return found
+
+
+def _is_hdf5(path: Path) -> bool:
+    """Tell whether a file begins as HDF5 does, or with the mark that ours have before it."""
+    return begins(path, re.escape(HDF5_SIGNATURE)) or begins(path, re.escape(HDF5_MARK))
 
 
 def _is_run(path: Path) -> bool:
@@ -190,7 +197,7 @@ def _check_no_other_kind(path: Path) -> None:
 
 def _foreign_exr(path: Path) -> str:
     """Say what a file is that ends in .exr, and that we did not write."""
-    if begins(path, re.escape(HDF5_SIGNATURE)) or begins(path, re.escape(HDF5_MARK)):
+    if _is_hdf5(path):
         return "is an HDF5 file under the name of an OpenEXR file; give it the ending .h5"
     if begins(path, re.escape(EXR_SIGNATURE)):
         return "is an OpenEXR picture of another program"

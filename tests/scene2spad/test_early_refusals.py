@@ -157,6 +157,8 @@ def test_a_render_that_cannot_be_is_refused_before_it_begins(tmp_path, capsys, m
         ("chip --models file.txt", "file.txt: is a file, expected a folder of models (--models)"),
         ("chip --retrain --models file.txt", "file.txt: is a file, expected a folder for the models"),
         ("chip --retrain --set nosuch.h5", "nosuch.h5: file not found (--set)"),
+        ("chip --retrain --set file.txt", "file.txt: is no pack of scene2spad (--set)"),
+        ("depth-offset --retrain --set .", ".: no set of scene2spad, it has no index.jsonl (--set)"),
         ("chip --set nosuch.h5", "--set nosuch.h5 is for models that are trained (--retrain or --preset smoke)"),
         ("transport --preset smoke --set nosuch.h5", "--set nosuch.h5 is for models that are trained"),
         ("power --preset smoke --models nosuch", "nosuch: folder of models not found (--models)"),

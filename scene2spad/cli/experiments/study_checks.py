@@ -8,7 +8,7 @@ from pathlib import Path
 
 from csph.codes.design import Design
 from scene2spad.cli.checks import check_image, check_model
-from scene2spad.cli.paths import input_file, output_folder
+from scene2spad.cli.paths import holds_kind, input_file, output_folder
 from scene2spad.options.common import only_for
 from scene2spad.options.experiments import OPTIONS_OF, STUDIES, Study, trains_models
 from scene2spad.options.networks import PLANES
@@ -46,12 +46,21 @@ def _check_training(command: Study, names: tuple[str, ...]) -> None:
     used = trains or "depth-offset" in names
     only_for(command, f"study {command.name}", {"set": (used, "models that are trained (--retrain or --preset smoke)")})
     if command.set is not None and command.set != PLANES:
-        require(command.set.exists(), f"{command.set}: file not found (--set)")
+        _check_set(command.set)
     if command.models is None:
         return
     if trains:
         output_folder(command.models, "the models")
     require(command.models.is_dir() or (trains and not command.models.exists()), _no_folder(command.models))
+
+
+def _check_set(path: Path) -> None:
+    """Check that a set is one as far as a glance tells: a pack, or a folder with the index of a set."""
+    require(path.exists(), f"{path}: file not found (--set)")
+    if path.is_dir():
+        require((path / "index.jsonl").is_file(), f"{path}: no set of scene2spad, it has no index.jsonl (--set)")
+    else:
+        require(holds_kind(path, "pack"), f"{path}: is no pack of scene2spad (--set)")
 
 
 def _no_folder(path: Path) -> str:
