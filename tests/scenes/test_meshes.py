@@ -313,7 +313,7 @@ def test_refuses_a_missing_file_a_folder_and_an_unknown_kind(tmp_path):
         ("vast.obj", "v -1e308 0 0\nv 1e308 0 0\nv 0 1 0\nf 1 2 3\n", "1e+308, expected 1e+12 at the most"),
         ("empty.ply", "", "empty"),
         ("garbage.ply", "no mesh\n", "broken .ply"),
-        ("garbage.stl", "no mesh\n", "empty"),
+        ("garbage.stl", "no mesh\n", "is no STL"),
         ("empty.stl", "", "empty"),
         ("garbage.glb", "no mesh, but long enough for a header\n", "broken .glb"),
         ("empty.glb", "", "empty"),
