@@ -137,7 +137,7 @@ def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *
         lit = hit & ((radiance > 0) | (albedo(world, si, hit) == 0))
     flags = dr.select(hit, HIT, UInt32(0)) | dr.select(lit, LIT, UInt32(0)) | dr.select(hit & ~small, LARGE, UInt32(0))
     if clip:
-        path, half, clipped = _clip_to_face(world, si, path, half, hit & ~small)
+        path, half, clipped = _clip_to_face(world, si, optical + leg, path, half, hit & ~small)
         flags |= dr.select(clipped, CLIPPED, UInt32(0))
     facing = dr.abs(dr.dot(si.sh_frame.n, to_laser))
     zero = Float(0)
@@ -202,11 +202,12 @@ def _refracted_footprints(world: TracedScene, column: UInts, packed: UInts, grid
 
 
 def _clip_to_face(
-    world: TracedScene, si: Interactions, path: Floats, half: Floats, active: Masks
+    world: TracedScene, si: Interactions, at_hit: Floats, path: Floats, half: Floats, active: Masks
 ) -> tuple[Array, Array, Array]:
-    """Clip intervals of path length to the face that they lie on; middle, half width and whether that changes them."""
-    near, far = _face_span(world, si, path, active)
-    low, high = dr.maximum(path - half, near), dr.minimum(path + half, far)
+    """Clip intervals of path length, path +- half, to the face that they lie on, from the path at the point that was
+    hit; middle, half width and whether that changes them. An interval beside the face becomes the nearest end of it."""
+    near, far = _face_span(world, si, at_hit, active)
+    low, high = dr.clip(path - half, near, far), dr.clip(path + half, near, far)
     cut = active & ~((near <= path - half) & (far >= path + half))
     return dr.select(cut, 0.5 * (low + high), path), dr.select(cut, 0.5 * (high - low), half), cut
 

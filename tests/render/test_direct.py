@@ -136,6 +136,20 @@ def test_footprint_ends_where_its_face_ends():
     assert (light.samples.path_m + light.samples.half_width_m).max() < corner
 
 
+@pytest.mark.parametrize("angle_deg", [85, 87, 89])
+@pytest.mark.parametrize("grid", [1, 3])
+def test_footprints_of_cut_cells_end_where_their_face_ends(angle_deg, grid):
+    """A strip of 40 x 50 cm, nearly edge on: rays of cut cells are beside their middles, whose points on the tangent
+    plane may lie metres beyond the face. A bound by tangents is short by what its width bends the path."""
+    s, c, wide = np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg)), 0.4
+    near, far = np.array([0, -1e-4, -2.0]), np.array([0, -1e-4, -2.0]) + 0.5 * np.array([0, c, -s])
+    strip = [end + [side * wide / 2, 0, 0] for end, side in ((near, -1), (near, 1), (far, 1), (far, -1))]
+    light = direct(Scene("strip", (quad(strip),), camera(9, 9, 20)), grid, refine=1, edge_threshold=1)
+    assert len(light.samples.pixel) > 0 and light.clipped > 0
+    assert (light.samples.path_m - light.samples.half_width_m).min() > 4.0 - wide**2 / 2
+    assert (light.samples.path_m + light.samples.half_width_m).max() < 2 * np.linalg.norm(strip[2]) + 1e-5
+
+
 def test_sphere_limb():
     """Sphere: d = c - sqrt(r^2 - s^2), cosine from the normal; midpoint rule, since the limb is not smooth."""
     vertices, faces, _ = sphere(0.5, 7)
