@@ -361,7 +361,8 @@ def test_zones_tell_how_much_of_their_light_wraps():
     sensor = replace(SENSOR, period_s=6.4e-9)
     assert sense_zones(view(), sensor, TWO).meta["wrapped"] == 0
     late = sense_zones(view(1.2), sensor, TWO).meta
-    assert late["wrapped"] == 1 and any(line.startswith("wrap: 100.000% of the light") for line in late["plan"])
+    assert late["wrapped"] == pytest.approx(1)
+    assert any(line.startswith("wrap: 100.000% of the light") for line in late["plan"])
     assert late["dark_share"] is None, "a zone's background is not told apart"
     period_m = 1.9187  # of path: returns on both sides of the period's end count by what lies behind it
     near, far = (np.array(ends) * period_m for ends in ([0.9, 1.0, 1.2], [1.4, 1.0, 1.5]))
