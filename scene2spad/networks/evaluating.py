@@ -191,7 +191,9 @@ def _scenes_counted(path: Path, views: Views) -> JsonObject:
             "%s: scenes of %d of %d views are known by name alone: intervals count each name as one scene, %d in all"
         )
         log.warning(message, path, unsure, len(views.scenes), scenes)
-    if scenes < FEW_SCENES:
+    if scenes == 1:
+        log.info("a single scene has no 95 % interval")
+    elif scenes < FEW_SCENES:
         log.info("95 %% intervals of %d scenes are wide, and trust their errors to be normal (Student)", scenes)
     return {"scenes": scenes, "unsure_scenes": unsure, "interval_level": INTERVAL_LEVEL}
 
