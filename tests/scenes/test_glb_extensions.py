@@ -59,7 +59,7 @@ def test_a_texture_is_scaled_then_turned_then_moved(tmp_path: Path, transform: d
 
 @pytest.mark.parametrize("based", [True, False])
 def test_sparse_positions_replace_what_they_name(tmp_path: Path, based: bool) -> None:
-    """Of an accessor with numbers, or of one that is 0 where nothing is named."""
+    """Replace some of an accessor that has numbers, and of one that is 0 where nothing is named."""
     path = glb(tmp_path / "a.glb", {"POSITION": CORNERS, "TEXCOORD_0": UV}, TEXTURED)
     start = struct.unpack_from("<I", path.read_bytes(), 20 + struct.unpack_from("<I", path.read_bytes(), 12)[0])[0]
     places, values = np.array([1, 2], np.uint16), np.array([(3, 0, 0), (3, 4, 5)], np.float32)
@@ -116,7 +116,7 @@ def test_a_file_without_anything_visible_is_refused(tmp_path: Path) -> None:
 
 
 def test_compression_that_is_not_declared_as_needed_is_refused_in_a_line(tmp_path: Path) -> None:
-    """Of Draco, and of meshopt whose fallback buffer has no numbers."""
+    """Read Draco, and meshopt whose fallback buffer has no numbers."""
 
     def draco(header: dict) -> None:
         header["meshes"][0]["primitives"][0]["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0}}

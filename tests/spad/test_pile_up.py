@@ -159,7 +159,7 @@ def test_confidence_of_corrected_depth_is_that_of_corrected_counts() -> None:
 
 @pytest.mark.parametrize("dead_bins", [1.0, 2.5, 6.0, 16.3, 40.3])
 def test_even_light_is_found_as_high_as_is_said(dead_bins: float) -> None:
-    """Of r photons a bin and cycle r / (1 + r dead) are detected; the bins' mean live time gives 2 atanh(r / 2)."""
+    """Detect r / (1 + r dead) of r photons a bin and cycle: the bins' mean live time gives 2 atanh(r / 2)."""
     sensor = Sensor(bins=16, bin_width_s=1e-9, dead_time_s=dead_bins * 1e-9, reset="free-running")
     for rate in (0.1, 0.5):
         counts = torch.full((16,), 1e6 * rate / (1 + rate * dead_bins), dtype=torch.float64)
