@@ -35,7 +35,7 @@ from render.indirect.light_vertices import (
     sample_light_vertices,
 )
 from render.indirect.path_space_filter import Point, late_from, point_of
-from render.indirect.path_suffixes import PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
+from render.indirect.path_suffixes import JoinedVertex, PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
 from render.indirect.primary_vertices import PrimaryVertices, connect_primary_vertices, reuses_early_paths
 from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, kept, parts_of, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
@@ -105,7 +105,11 @@ def trace_paths(task: PathTask) -> PathBatch:
         PrimaryVertices(primary[0], interaction_from_parts(primary[1]), *primary[2:-2], late_m, point),  # type: ignore[call-arg]
         tuple(Connection(*light) for light in near),
         tuple(Connection(*light) for light in retro),
-        PathSuffixes(interaction_from_parts(suffixes[0]), *suffixes[1:]),
+        PathSuffixes(  # type: ignore[call-arg]
+            interaction_from_parts(suffixes[0]),
+            *suffixes[1:-1],
+            None if suffixes[-1] is None else JoinedVertex(*suffixes[-1]),
+        ),
         light_vertices,
         batch,
     )
@@ -175,7 +179,8 @@ def _paths(
     task = SuffixTask(light_vertices, connections, batch, pixel, random, slots, reused)
     suffixes, retro = trace_suffixes(world, primary, Scattered(sample, weight[0]), task)
     of_primary = receiver, parts_of(si), *map(_of_any_length, primary[2:-1]), None if point is None else tuple(point)
-    of_suffixes = parts_of(suffixes.si), *map(_of_any_length, suffixes[1:])
+    joined = None if suffixes.joined is None else tuple(map(_of_any_length, suffixes.joined))
+    of_suffixes = parts_of(suffixes.si), *map(_of_any_length, suffixes[1:-1]), joined
     lights = (tuple(tuple(light) for light in connections) for connections in (near, retro))
     return of_primary, *lights, of_suffixes, batch
 

@@ -45,6 +45,7 @@ from render.scene.rays import (
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
 RATIO = 1.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
+MAX_LIGHT_PATHS = 2.0  # for every path from the camera (1 to 4 do as well in a varnished hall under a lamp)
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
 SEEN_BY, ELSEWHERE = 2, 1 / 8
 WIDEST_DEG = 60.0  # off the optical axis, which the image of a wider laser does not show as a plane
@@ -104,6 +105,9 @@ def _look_for(world: TracedScene) -> tuple[Array, ...]:
     if not polished.any():
         return ()
     sampling_density = np.where(own & ~polished, ELSEWHERE, polished)
+    # what a wide laser lights beyond the view is large, and throws little of its light into it
+    most = MAX_LIGHT_PATHS / RATIO * camera.width * camera.height
+    sampling_density = sampling_density * min(1, most / sampling_density.sum())
     # of no launch's length, or Dr.Jit would record it anew (`render.indirect.camera_paths`)
     return upload(Float, sampling_density, 16 * (sampling_density.size // 16 + 1) + 5), *image
 

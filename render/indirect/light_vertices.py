@@ -7,10 +7,12 @@ chance keeps the share
 
     w = B q / (B q + p d^2 / cos),
 
-where q = cos / pi is the density, per solid angle, of a diffuse lobe (taken for every diffuse reflectance, coated or
-not, so that w does not depend on how the path came), p the density of lit points per area, d the distance and cos the
-cosine at the far end: the balance heuristic (Veach, eq. 9.8). Joining has the rest, of diffuse lobes alone: mirror-like
-ones go on by chance.
+where q is the density per solid angle of what sends the path there, B the number of pixels that use it, p the density
+of lit points per area, d the distance and cos the cosine at the far end: the balance heuristic (Veach, eq. 9.8).
+
+After x1 q is the density of all lobes of the vertex, and joining has the rest of all that they reflect but mirror-like
+lobes. What a filter reads from its regions is diffuse at x1, so there q is that of a diffuse lobe, cos / pi, for every
+diffuse reflectance, coated or not; joining has the rest of diffuse light alone.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from render.indirect.glossy import has_light_paths, ratio_at_laser
 from render.scene.rays import (
     TOUCHING,
     first_opaque,
+    gather_vector,
     interaction_from_parts,
     laser_light,
     parts_of,
@@ -138,22 +141,27 @@ def _cap(world: TracedScene) -> Array:
     return 2 * dr.square(dr.sin(0.5 * world.half_angle))
 
 
-def densities(
-    cosine: Floats, distance2: Floats, far_cosine: Floats, density: Floats, copies: Floats
-) -> tuple[Array, Array]:
-    """Return per solid angle: density of `copies` diffuse lobes at that cosine, and of these and lit points
-    together."""
-    lobes = copies / math.pi * dr.abs(cosine)
-    return lobes, lobes + density * distance2 / dr.maximum(dr.abs(far_cosine), MIN_FAR_COSINE)
+def lit_density(density: Floats, distance2: Floats, far_cosine: Floats) -> Array:
+    """Return the density per solid angle of light vertices that have this `density` per area, at that distance."""
+    return density * distance2 / dr.maximum(dr.abs(far_cosine), MIN_FAR_COSINE)
 
 
-def mis_weight_bsdf(
-    diffuse: Floats, cosine: Floats, distance2: Floats, far_cosine: Floats, density: Floats, copies: Floats
-) -> Array:
-    """Return share of a lit point's light that paths keep which go there by chance, from a surface that reflects the
-    share `diffuse` of it diffusely."""
-    lobes, both = densities(cosine, distance2, far_cosine, density, copies)
-    return 1 - diffuse * dr.select(both > 0, 1 - lobes / both, 0)
+def mis_weight_bsdf(lobes: Floats, lit: Floats) -> Array:
+    """Return the share of a lit point's light that paths keep which go there by chance, from the densities per solid
+    angle of the lobes that send them there and of light vertices."""
+    return dr.select(lobes + lit > 0, lobes / (lobes + lit), 1)
+
+
+def mis_weight_sampled(sample: LobeSamples, lit: Floats, copies: Floats = 1) -> Array:
+    """Return `mis_weight_bsdf` of a point that was met in a sampled direction; 1 of mirror-like lobes."""
+    smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    return dr.select(smooth, 1, mis_weight_bsdf(copies * sample.pdf, lit))
+
+
+def mis_weight_filtered(diffuse: Floats, cosine: Floats, lit: Floats, copies: Floats) -> Array:
+    """Return `mis_weight_bsdf` at a surface that joins light vertices diffusely alone, as filters want it; `diffuse` is
+    the fraction that it reflects so."""
+    return 1 - diffuse * (1 - mis_weight_bsdf(copies / math.pi * dr.abs(cosine), lit))
 
 
 def diffuse_fraction(world: TracedScene, si: Interactions, direction: Vectors, value: Floats, active: Masks) -> Array:
@@ -171,23 +179,14 @@ class Scattered(NamedTuple):
     weight: Floats
 
 
-def mis_weight_sampled(
-    world: TracedScene,
-    si: Interactions,
-    scattered: Scattered,
-    end: Interactions,
-    density: Floats,
-    copies: Floats,
-    active: Masks,
+def mis_weight_sampled_filtered(
+    world: TracedScene, si: Interactions, scattered: Scattered, lit: Floats, copies: Floats, active: Masks
 ) -> Array:
-    """Return `mis_weight_bsdf` of a lit point `end` that was met in the direction scattered by `si`."""
+    """Return `mis_weight_filtered` in the direction scattered by `si`."""
     sample, weight = scattered
-    direction = si.to_world(sample.wo)
-    diffuse = diffuse_fraction(world, si, direction, weight * sample.pdf, active)
+    diffuse = diffuse_fraction(world, si, si.to_world(sample.wo), weight * sample.pdf, active)
     diffuse = dr.select(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), 0, diffuse)
-    offset = end.p - si.p
-    far_cosine = dr.dot(end.n, direction)
-    return mis_weight_bsdf(diffuse, sample.wo.z, dr.squared_norm(offset), far_cosine, density, copies)
+    return mis_weight_filtered(diffuse, sample.wo.z, lit, copies)
 
 
 def _diffuse() -> Array:
@@ -201,39 +200,65 @@ def light_vertex_index(light_vertices: LightVertices, batch: UInts, number: UInt
     return batch * light_vertices.each + number % light_vertices.each
 
 
+def reflect_diffusely(si: Interactions, local: Vectors, active: Masks) -> tuple[Array, Array]:
+    """Return what a surface reflects diffusely in a direction of its shading frame, cosine counted in, and the density
+    of a diffuse lobe there."""
+    return si.bsdf().eval(_diffuse(), si, local, active)[0], dr.abs(local.z) / math.pi
+
+
+def reflect(si: Interactions, local: Vectors, active: Masks) -> tuple[Array, Array]:
+    """Return what a surface reflects in a direction of its shading frame, cosine counted in, and the density of its
+    lobes there; mirror-like ones left out."""
+    value, density = si.bsdf().eval_pdf(mi.BSDFContext(), si, local, active)
+    return value[0], density
+
+
+class Arrival(NamedTuple):
+    """Light of one light vertex at a surface.
+
+    light           what arrives there, cosine not counted in, over the density per area
+    path            from the surface to the laser [m]
+    direction       to the light vertex
+    density         of light vertices per solid angle in that direction
+    value, lobes    what the surface reflects of it, cosine counted in, and the density of its lobes
+    ratio           `ratio_at_laser` of the light vertex, with whose share the light is still to be weighted; None
+                    without light paths
+    """
+
+    light: Floats
+    path: Floats
+    direction: Vectors
+    density: Floats
+    value: Floats
+    lobes: Floats
+    ratio: Floats
+
+
 def connect_to_light_vertex(
     world: TracedScene,
     si: Interactions,
     light_vertices: LightVertices,
     point: Array,
     active: Masks,
-    copies: Callable[[Floats], Floats] = lambda path: 1,
-    connections: int = 1,
-) -> tuple[Array, Array, Array, Array]:
-    """Connect a surface to one light vertex: light that it reflects diffusely from there, path to the laser, direction,
-    and `ratio_at_laser` of the light vertex, with whose share the light is still to be weighted; None without light
-    paths.
-
-    The light goes towards `si.wi`. It is divided by the density of all `connections` of this kind together with as many
-    lobes as `copies` says of the path.
-    """
+    reflected: Callable[[Interactions, Vectors, Masks], tuple[Array, Array]] = reflect,
+) -> Arrival:
+    """Connect a surface to one light vertex. What it makes of the light is `light` times `value` over the densities of
+    all techniques together: its `lobes` and light vertices."""
     end = dr.gather(mi.SurfaceInteraction3f, light_vertices.si, point, active)
     irradiance = dr.gather(Float, light_vertices.irradiance, point, active)
     offset = end.p - si.p
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
-    local = si.to_local(direction)
     active = active & (irradiance > 0) & (distance2 > 0)
-    value = si.bsdf().eval(_diffuse(), si, local, active)[0]
+    value, lobes = reflected(si, si.to_local(direction), active)
     active &= value > 0
     end.wi = end.to_local(-direction)
-    to_laser = mi.Vector3f(*(dr.gather(Float, part, point, active) for part in light_vertices.to_laser))
-    value *= end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
-    active &= value > 0
+    to_laser = gather_vector(light_vertices.to_laser, point, active)
+    light = end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
+    active &= light > 0
     passed, leg = segment(world, si, end.p, active, spread=False)
     path = leg + dr.gather(Float, light_vertices.path, point, active)
-    density = dr.gather(Float, light_vertices.density, point, active) * connections
-    _, both = densities(local.z, distance2, dr.dot(end.n, direction), density, copies(path))
-    light = dr.select(active, value * passed / both, 0)
+    density = lit_density(dr.gather(Float, light_vertices.density, point, active), distance2, dr.dot(end.n, direction))
     ratio = ratio_at_laser(world, end, -direction, active) if has_light_paths(world) else None
-    return dr.select(dr.isfinite(light), light, 0), path, direction, ratio
+    light = dr.select(active & dr.isfinite(light * passed), light * passed, 0)
+    return Arrival(light, path, direction, density, value, lobes, ratio)

@@ -15,6 +15,7 @@ from render.indirect.glossy import (
     reversal_of_sample,
 )
 from render.indirect.light_vertices import (
+    Arrival,
     Connection,
     LightVertices,
     Scattered,
@@ -22,14 +23,62 @@ from render.indirect.light_vertices import (
     connects_suffixes,
     density_of,
     light_vertex_index,
+    lit_density,
+    mis_weight_bsdf,
     mis_weight_sampled,
+    mis_weight_sampled_filtered,
+    reflect,
 )
 from render.indirect.primary_vertices import PrimaryVertices, sampling_techniques
 from render.indirect.retro_paths import ReachedVertex, connect_retro
-from render.scene.rays import first_opaque, kept, laser_light, sample_bsdf, shape_index, spawn
+from render.scene.rays import first_opaque, gather_vector, kept, laser_light, sample_bsdf, shape_index, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 MIN_REVERSAL = 1e-12  # of x2, by which is divided
+
+
+class JoinedVertex(NamedTuple):
+    """x2 joined to a light vertex, where what it reflects of that depends on where it is seen from.
+
+    The first slot of `PathSuffixes` then holds what arrives at x2 from the light vertex, and every pixel reflects it
+    as it sees x2; the second slot holds all of x3's laser light, which every pixel weights by `mis_weight_bsdf`.
+
+    direction             from x2 to the light vertex
+    density               of light vertices per solid angle in that direction
+    onward_density        the same in the direction to x3
+    reflected             what x2 makes of that light as the pixel itself sees it: what all do where x2 is diffuse
+    own_value, own_ratio  the pixel's own factor of the first slot, and of the ratio there or None
+    own_weight            the pixel's own weight of the second slot
+    """
+
+    direction: Vectors
+    density: Floats
+    onward_density: Floats
+    reflected: Floats
+    own_value: Floats
+    own_ratio: Floats
+    own_weight: Floats
+
+
+class JoinedFactors(NamedTuple):
+    """Factors of light that comes by `JoinedVertex`: of the first slot, of its ratio or None, and of the second slot
+    beside the factor of all light from beyond x2."""
+
+    value: Floats
+    ratio: Floats
+    weight: Floats
+
+
+class SeenVertex(NamedTuple):
+    """x2 as x1 of any pixel of the block sees it: factor of light from there, `ratio_at_camera` of x1 or None, density
+    of the lobes of x2 towards x3; where it is seen, and where the path goes on."""
+
+    si: Interactions
+    reach: Floats
+    at_x1: Floats
+    onward_density: Floats
+    active: Masks
+    going: Masks
 
 
 class PathSuffixes(NamedTuple):
@@ -45,6 +94,7 @@ class PathSuffixes(NamedTuple):
     own_ratio, ratios   where light paths are traced: factors that x1 with x2, and what lies beyond, have in the ratio
                         of densities that decides what these take of such a value (`render.indirect.glossy`)
     soonest_m           the shortest of these paths and `laser_path` that carries light
+    joined              None where x2 reflects light of its connection to every pixel alike, or has no connection
     """
 
     si: Interactions
@@ -68,6 +118,7 @@ class PathSuffixes(NamedTuple):
     ratios: Floats
     length: UInts
     soonest_m: Floats
+    joined: JoinedVertex | None
 
 
 class Slots(NamedTuple):
@@ -119,11 +170,7 @@ class SuffixTask(NamedTuple):
 def trace_suffixes(
     world: TracedScene, primary: PrimaryVertices, scattered: Scattered, task: SuffixTask
 ) -> tuple[PathSuffixes, tuple[Connection, ...]]:
-    """Trace suffixes in sampled directions; return them, and light that comes back over x1 if there is any.
-
-    If they are reused, x2 on a rough coat is not connected to light vertices: what it reflects diffusely depends on
-    where it is seen from, and light of connections is handed on as one number.
-    """
+    """Trace suffixes in sampled directions; return them, and light that comes back over x1 if there is any."""
     (sample, weight), (light_vertices, connections, _, pixel, random, _, reused) = scattered, task
     x1, alive, direction = primary.si, primary.valid & (weight > 0), primary.si.to_world(sample.wo)
     si, passed, leg, _ = first_opaque(world, spawn(x1, direction), alive, x1.p)
@@ -133,30 +180,32 @@ def trace_suffixes(
     density = None if light_vertices is None else density_of(world, si, to_laser) * connections
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), alive)[0] * irradiance
     if light_vertices is not None:
-        value *= mis_weight_sampled(
-            world, x1, scattered, si, density, sampling_techniques(primary, leg + laser_path), alive
-        )
+        lit = _lit_density(si, density, x1, direction)
+        value *= _mis_weight_at_x1(world, primary, scattered, lit, leg + laser_path, alive)
     # what is reflected by a mirror in the first place cannot be read backwards
     readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     onward, (onward_weight, *_) = sample_bsdf(si, random, alive)
-    own_ratio, own_retro, at_x2 = None, None, Float(1)
-    back: tuple[Connection, ...] = ()
+    at_x1, at_x2 = None, Float(1)
     if has_light_paths(world):
-        own_ratio = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
-        value *= camera_share(own_ratio * ratio_at_laser(world, si, -direction, readable))
-        goes_on = readable & (task.slots.count > 0)  # x3 is a surface more
-        at_vertex = ReachedVertex(x1, sample, own, own_ratio, leg, si, goes_on)
-        own_retro, back = connect_retro(world, at_vertex, onward, pixel, random)
+        at_x1 = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
         at_x2 = dr.maximum(finite_ratio(reversal_of_sample(si, onward, alive)), MIN_REVERSAL)
-        own_ratio = finite_ratio(own_ratio * at_x2)
+        value *= camera_share(at_x1 * ratio_at_laser(world, si, -direction, readable))
     value = dr.select(alive & dr.isfinite(value), own * value, 0)
-    connectable = _connectable(world, si, alive, reused=reused)
+    goes_on = alive & (task.slots.count > 0)  # x3 is a surface more
+    reached = ReachedVertex(x1, sample, own, at_x1, leg, si, readable & goes_on)
+    own_retro, back = connect_retro(world, reached, onward, pixel, random)
     scale = dr.select(onward_weight > 0, onward_weight, 1)
-    state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, 1 / scale, connectable, at_x2)
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
-    light = _trace_suffix(world, task, state, alive, soonest)
+    joined = reused and world.has_rough_lobes and _connects_suffix(world, light_vertices)
+    unit, at_sample = (Float(1), Float(1)) if joined else (1 / scale, at_x2)
+    state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, unit, at_sample)
+    *light, (towards, lit, reflected, turned), (onward_lit, own_weight) = _trace_suffix(
+        world, task, state, goes_on, soonest, joined=joined
+    )
     reusable = primary.allows_reuse & _shares(world, si, sample, alive)
-    suffixes = PathSuffixes(
+    own_ratio = None if at_x1 is None else finite_ratio(at_x1 * turned)
+    x2_joined = JoinedVertex(towards, lit, onward_lit, reflected, own * reflected, own_ratio, own_weight)
+    suffixes = PathSuffixes(  # type: ignore[call-arg]
         kept(si),
         direction,
         alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection),
@@ -171,18 +220,22 @@ def trace_suffixes(
         dr.select(alive, passed, 0),
         value,
         own * scale,
-        own_ratio,
+        None if at_x1 is None else finite_ratio(at_x1 * at_x2),
         own_retro,
         *light,
+        x2_joined if joined else None,
     )
     return suffixes, back
 
 
-def _connectable(world: TracedScene, x2: Interactions, alive: Masks, *, reused: bool) -> Array:
-    """Return whether x2 is connected to light vertices: not on a rough coat if suffixes are `reused`."""
-    if reused and world.has_rough_coats:
-        return alive & (dr.gather(Float, world.rough_coats, shape_index(x2), alive) == 0)
-    return Bool(alive)
+def _mis_weight_at_x1(
+    world: TracedScene, primary: PrimaryVertices, scattered: Scattered, lit: Floats, path: Floats, alive: Masks
+) -> Array:
+    """Return `mis_weight_bsdf` of x2's laser light, of this path from x1 to the laser."""
+    copies = sampling_techniques(primary, path)
+    if primary.is_filtered:
+        return mis_weight_sampled_filtered(world, primary.si, scattered, lit, copies, alive)
+    return mis_weight_sampled(scattered.sample, lit, copies)
 
 
 def _shares(world: TracedScene, x2: Interactions, sample: LobeSamples, alive: Masks) -> Array:
@@ -195,8 +248,7 @@ class _SuffixState(NamedTuple):
     """Current vertices of paths and their continuation: a sample of the surface's lobes and its weight.
 
     `throughput` is the factor of light that comes from there, `throughput_at_vertex` that of light reflected on the
-    spot, reflectance counted in that light; `connectable` says whether there is such. `reversal` is that of the sample,
-    which is no part of the ratios beyond.
+    spot, reflectance counted in that light. `reversal` is that of the sample, which is no part of the ratios beyond.
     """
 
     si: Interactions
@@ -204,38 +256,41 @@ class _SuffixState(NamedTuple):
     weight: Floats
     throughput: Floats
     throughput_at_vertex: Floats
-    connectable: Masks
     reversal: Floats
 
 
 @dr.syntax
 def _trace_suffix(
-    world: TracedScene, task: SuffixTask, state: _SuffixState, active: Masks, soonest: Floats
+    world: TracedScene, task: SuffixTask, state: _SuffixState, active: Masks, soonest: Floats, *, joined: bool
 ) -> tuple[Array, ...]:
     """Light of x3, x4, ... that goes to x2 along the path, divided by the density of the path after x2.
 
     Returns radiances, path lengths from x2 to the laser, and ratios, in their slots; how many slots each lane has
-    filled, and the shortest path.
+    filled, and the shortest path. Then of x2, if it is `joined` as `JoinedVertex` has it: direction and density of
+    light vertices, what it reflects and its reversal there; and of x3 the density, and the pixel's own weight.
     """
     batch, pixel, random = task.batch, task.pixel, task.random
     light_vertices: Array = task.light_vertices  # None where nothing is connected
     lanes, connecting = dr.width(pixel), _connects_suffix(world, light_vertices)
     lane, stride, last = task.slots.lane, task.slots.lanes, task.slots.count
     slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
-    si, sample = mi.SurfaceInteraction3f(state.si), mi.BSDFSample3f(state.sample)
-    weight, connectable = Float(state.weight), Bool(state.connectable)
+    si, sample, weight = mi.SurfaceInteraction3f(state.si), mi.BSDFSample3f(state.sample), Float(state.weight)
     throughput, throughput_at_vertex = Float(state.throughput), Float(state.throughput_at_vertex)
     active = Bool(active) & (slot < last)
     # factors of the vertices between x2 and the current one, of the current one, and what a connection leaves out
     ratio, step, given = dr.full(Float, 1, lanes), dr.full(Float, 1, lanes), state.reversal + dr.zeros(Float, lanes)
+    x2, x3 = (dr.zeros(mi.Vector3f, lanes), *(dr.zeros(Float, lanes),) * 3), (dr.zeros(Float, lanes),) * 2
     while active:
+        first = slot == 0
         if dr.hint(connecting, mode="scalar"):
-            chosen, joining = light_vertex_index(light_vertices, batch, random.next_uint32()), active & connectable
-            light, leg, direction, end = connect_to_light_vertex(world, si, light_vertices, chosen, joining)
-            light *= throughput_at_vertex
-            joined = _ratio_of_connection(si, direction, end, ratio / given, active)
-            _put(task.slots, slot * stride + lane, light, path + leg, joined, active)
-            soonest = dr.select(light > 0, dr.minimum(soonest, path + leg), soonest)
+            chosen = light_vertex_index(light_vertices, batch, random.next_uint32())
+            arrival, reflected, turned = _join(world, si, light_vertices, chosen, active)
+            light, leg = throughput_at_vertex * arrival.light * reflected, arrival.path
+            met = _times(ratio / given * turned, arrival.ratio)
+            if dr.hint(joined, mode="scalar"):
+                x2 = _where(first, (arrival.direction, arrival.density, reflected, turned), x2)
+                light, met = dr.select(first, arrival.light, light), _where(first, (arrival.ratio,), (met,))[0]
+            soonest = _put(task.slots, slot * stride + lane, (light, path + leg, met), soonest, active)
             slot += 1
         active &= weight > 0
         before, towards = kept(si), spawn(si, si.to_world(sample.wo))
@@ -245,39 +300,54 @@ def _trace_suffix(
         to_laser, irradiance, leg = laser_light(world, si, pixel, active, seen_by_camera=None)
         light = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_laser), active)[0] * irradiance
         if dr.hint(connecting, mode="scalar"):
-            density = density_of(world, si, to_laser)
-            by_chance = mis_weight_sampled(world, before, Scattered(sample, weight), si, density, 1, active)
-            light *= dr.select(connectable, by_chance, 1)
+            lit = _lit_density(si, density_of(world, si, to_laser), before, towards.d)
+            by_chance = mis_weight_sampled(sample, lit)
+            if dr.hint(joined, mode="scalar"):
+                x3, by_chance = _where(first, (lit, by_chance), x3), dr.select(first, 1, by_chance)
+            light *= by_chance
         throughput_at_vertex = throughput * passed
-        light = dr.select(dr.isfinite(light), throughput_at_vertex * light, 0)
         ratio, given = finite_ratio(ratio * step), Float(1)
-        ended = _ratio_at_end(world, si, -towards.d, ratio, active)
-        _put(task.slots, slot * stride + lane, light, path + leg, ended, active)
-        soonest = dr.select(active & (light > 0), dr.minimum(soonest, path + leg), soonest)
+        vertex = light * throughput_at_vertex, path + leg, _ratio_at_end(world, si, -towards.d, ratio, active)
+        soonest = _put(task.slots, slot * stride + lane, vertex, soonest, active)
         slot += 1
         active &= slot < last
-        sample, again = sample_bsdf(si, random, active)
-        weight = again[0]
+        sample, (weight, *_) = sample_bsdf(si, random, active)
         throughput = throughput_at_vertex * weight
         if dr.hint(has_light_paths(world), mode="scalar"):
             step = finite_ratio(reversal_of_sample(si, sample, active))
         # Russian roulette: paths that carry little end early, the others carry their energy on
         survive = dr.clip(dr.select(weight > 0, throughput, throughput_at_vertex), 0.05, 0.95)
         active &= (throughput_at_vertex > 0) & (random.next_float32() < survive)
-        throughput /= survive
-        throughput_at_vertex /= survive
-        connectable = Bool(active)
-    return task.slots.values, task.slots.paths, task.slots.ratios, slot, soonest
+        throughput, throughput_at_vertex = throughput / survive, throughput_at_vertex / survive
+    return task.slots.values, task.slots.paths, task.slots.ratios, slot, soonest, x2, x3
 
 
-def _ratio_of_connection(si: Interactions, direction: Vectors, end: Floats, ratio: Floats, active: Masks) -> Array:
-    """Return the ratio of a path whose last two points are a surface and the light vertex that it was connected to in
-    this direction, from that of the points before and `end`, that of the light vertex; None where that is None."""
-    if end is None:
-        return None
-    local = si.to_local(direction)
-    density = si.bsdf().pdf(mi.BSDFContext(), si, local, active)
-    return finite_ratio(ratio * reversal(si, local, density, active) * end)
+def _join(
+    world: TracedScene, si: Interactions, light_vertices: LightVertices, chosen: UInts, active: Masks
+) -> tuple[Arrival, Array, Array]:
+    """Join a vertex to a light vertex: what arrives there, what the vertex makes of it, and its `reversal`, 1 without
+    light paths."""
+    arrival = connect_to_light_vertex(world, si, light_vertices, chosen, active)
+    reflected = arrival.value / (arrival.lobes + arrival.density)
+    reflected = dr.select(dr.isfinite(reflected), reflected, 0)
+    if arrival.ratio is None:
+        return arrival, reflected, Float(1)
+    return arrival, reflected, reversal(si, si.to_local(arrival.direction), arrival.lobes, active)
+
+
+def _where(chosen: Masks, new: tuple, old: tuple) -> tuple:
+    """Return new parts in the chosen lanes, old ones in others; None where that is None."""
+    return tuple(None if a is None else dr.select(chosen, a, b) for a, b in zip(new, old, strict=True))
+
+
+def _times(factor: Floats, ratio: Floats) -> Array:
+    """Return a finite ratio times a factor, None where it is None."""
+    return None if ratio is None else finite_ratio(factor * ratio)
+
+
+def _lit_density(end: Interactions, density: Floats, si: Interactions, direction: Vectors) -> Array:
+    """Return `lit_density` of a point that was met from `si` in a direction, of its density per area."""
+    return lit_density(density, dr.squared_norm(end.p - si.p), dr.dot(end.n, direction))
 
 
 def _ratio_at_end(world: TracedScene, si: Interactions, back: Vectors, ratio: Floats, active: Masks) -> Array:
@@ -286,9 +356,42 @@ def _ratio_at_end(world: TracedScene, si: Interactions, back: Vectors, ratio: Fl
     return finite_ratio(ratio * ratio_at_laser(world, si, back, active)) if has_light_paths(world) else None
 
 
-def _put(slots: Slots, place: UInts, light: Floats, path: Floats, ratio: Floats, active: Masks) -> None:
-    """Write a vertex's light, its path and its ratio, if it has one, into their slots."""
+def _put(slots: Slots, place: UInts, vertex: tuple[Floats, Floats, Floats], soonest: Floats, active: Masks) -> Array:
+    """Write light of a vertex, its path and its ratio, if it has one, into their slots; return the shortest path so far
+    that carries light."""
+    light, path, ratio = vertex
+    light = dr.select(dr.isfinite(light), light, 0)
     dr.scatter(slots.paths, path, place, active)
     dr.scatter(slots.values, light, place, active)
     if ratio is not None:
         dr.scatter(slots.ratios, ratio, place, active)
+    return dr.select(active & (light > 0), dr.minimum(soonest, path), soonest)
+
+
+def joined_factors(world: TracedScene, joined: tuple[Array, ...], suffix: UInts, seen: SeenVertex) -> JoinedFactors:
+    """Return the factors of suffixes, given the first four parts of `JoinedVertex`, for the pixels that have `seen` x2;
+    the value before division by a density."""
+    direction, density, onward_density, reflected = joined
+    rough = seen.active & (dr.gather(Float, world.rough_lobes, shape_index(seen.si), seen.active) > 0)
+    towards = seen.si.to_local(gather_vector(direction, suffix, rough))
+    value, lobes = reflect(seen.si, towards, rough)
+    value /= lobes + dr.gather(Float, density, suffix, rough)
+    value = seen.reach * dr.select(rough, value, dr.gather(Float, reflected, suffix, seen.active))
+    turned = dr.select(rough, reversal(seen.si, towards, lobes, rough), 1) if seen.at_x1 is not None else None
+    weight = mis_weight_bsdf(seen.onward_density, dr.gather(Float, onward_density, suffix, seen.going))
+    value = dr.select(seen.active & dr.isfinite(value), value, 0)
+    return JoinedFactors(value, None if turned is None else finite_ratio(seen.at_x1 * turned), weight)
+
+
+def slot_factors(onward: Floats, ratio: Floats, joined: JoinedFactors | None, number: UInts) -> tuple[Array, Array]:
+    """Return the factors of a slot's light and of its ratio, from those of all light from beyond x2; slots are numbered
+    from 1."""
+    if joined is None:
+        return onward, ratio
+    factor = dr.select(number == 1, joined.value, dr.select(number == 2, onward * joined.weight, onward))
+    return factor, None if ratio is None else dr.select(number == 1, joined.ratio, ratio)
+
+
+def fills_slots(onward: Floats, joined: JoinedFactors | None, before_first: Masks) -> Array:
+    """Return whether a slot that follows has light: the first of a joined x2 has if nothing comes from beyond, too."""
+    return onward > 0 if joined is None else (onward > 0) | (before_first & (joined.value > 0))

@@ -13,6 +13,8 @@ from render.indirect.light_vertices import (
     connect_to_light_vertex,
     connects_suffixes,
     light_vertex_index,
+    reflect,
+    reflect_diffusely,
 )
 from render.indirect.path_space_filter import Point
 from render.scene.traced_scene import Float, TracedScene, dr
@@ -33,6 +35,11 @@ class PrimaryVertices(NamedTuple):
     allows_reuse: Masks
     late_m: Floats
     point: Point | None
+
+    @property
+    def is_filtered(self) -> bool:
+        """Return whether late light is filtered: of light vertices x1 then gets diffuse light alone."""
+        return self.point is not None
 
     @property
     def early_m(self) -> Array:
@@ -57,19 +64,18 @@ def connect_primary_vertices(
     found: list[Connection] = []
     if light_vertices is None:
         return ()
+    reflected = reflect_diffusely if primary.is_filtered else reflect
     for number in range(connections):
-        light, path, direction, ratio = connect_to_light_vertex(
-            world,
-            primary.si,
-            light_vertices,
-            light_vertex_index(light_vertices, batch, first + number),
-            primary.valid,
-            lambda path: sampling_techniques(primary, path),
-            connections,
-        )
-        if ratio is not None:
-            light *= camera_share(ratio * ratio_at_camera(world, primary.si, direction, primary.valid))
-        found.append(Connection(light * primary.transmission, path, direction, primary.valid))
+        point = light_vertex_index(light_vertices, batch, first + number)
+        arrival = connect_to_light_vertex(world, primary.si, light_vertices, point, primary.valid, reflected)
+        both = sampling_techniques(primary, arrival.path) * arrival.lobes + connections * arrival.density
+        light = arrival.light * arrival.value / both
+        if arrival.ratio is not None:
+            density = None if primary.is_filtered else arrival.lobes
+            at_x1 = ratio_at_camera(world, primary.si, arrival.direction, primary.valid, density)
+            light *= camera_share(arrival.ratio * at_x1)
+        light = dr.select(dr.isfinite(light), light * primary.transmission, 0)
+        found.append(Connection(light, arrival.path, arrival.direction, primary.valid))
     return tuple(found)
 
 

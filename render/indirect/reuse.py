@@ -15,6 +15,7 @@ are disjoint from all others and stay their own.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Masks, UInts, Vectors
@@ -29,11 +30,17 @@ from render.indirect.glossy import (
     reversal,
 )
 from render.indirect.launch_layout import BLOCK
-from render.indirect.light_vertices import diffuse_fraction, mis_weight_bsdf
+from render.indirect.light_vertices import (
+    diffuse_fraction,
+    lit_density,
+    mis_weight_bsdf,
+    mis_weight_filtered,
+)
 from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
+from render.indirect.path_suffixes import JoinedFactors, SeenVertex, fills_slots, joined_factors, slot_factors
 from render.indirect.primary_vertices import reuses_early_paths
 from render.indirect.retro_paths import has_retro_paths, retro_ratio
-from render.scene.rays import interaction_from_parts, parts_of, segment, spawn
+from render.scene.rays import gather_vector, interaction_from_parts, parts_of, segment, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 # Of one launch, 30 and 75 MB in its course.
@@ -139,23 +146,26 @@ class _Ends(NamedTuple):
     onward: Masks
     onward_direction: Vectors
     density: Floats
+    joined: tuple | None
 
 
 class _Connections(NamedTuple):
     """Connections of every pair: leg x1 to x2 [m], pixel radiance of x2's laser light and factor of the light from
     beyond x2, both before division by a density; the ratio of x1 with x2, and `retro_ratio` of what follows, or None;
-    and the sums of the sampling densities over each group."""
+    `JoinedFactors` or None; and the sums of the sampling densities over each group."""
 
     leg: Floats
     value: Floats
     onward: Masks
     ratio: Floats
     retro: Floats
+    joined: tuple | None
     density: Floats
     onward_density: Array
+    joined_density: Floats
 
 
-def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> tuple[Array, ...]:
+def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array, filtered: bool) -> tuple[Array, ...]:
     """Compute the fields of `_Connections` for pairs of primary vertex and suffix."""
     vertex, suffix, _ = _pairs_of(number, chosen)[:3]
     ends = _Ends(*ends)
@@ -175,65 +185,77 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array) -> 
     leg = dr.select(own, dr.gather(Float, ends.leg, suffix, reusable), leg)
     active = reusable & (value1[0] > 0) & (passed > 0) & (distance2 > 0)
     si2.wi = si2.to_local(-direction)
-    to_laser = si2.to_local(_gather_vector(ends.to_laser, suffix, active))
+    to_laser = si2.to_local(gather_vector(ends.to_laser, suffix, active))
     value2 = si2.bsdf().eval(context, si2, to_laser, active)[0]
     irradiance = dr.gather(Float, ends.irradiance, suffix, active)
     going = active & dr.gather(Bool, ends.onward, suffix, active)
-    onward = si2.to_local(_gather_vector(ends.onward_direction, suffix, going))
+    onward = si2.to_local(gather_vector(ends.onward_direction, suffix, going))
     value3, density3 = si2.bsdf().eval_pdf(context, si2, onward, going)
     area = dr.abs(dr.dot(si2.n, direction)) / distance2
     reach = dr.gather(Float, ends.transmission, vertex, active) * value1[0] * area * passed
     if ends.density is not None:
-        value2 *= mis_weight_bsdf(
-            diffuse_fraction(world, si1, direction, value1[0], active),
-            dr.dot(si1.sh_frame.n, direction),
-            distance2,
-            dr.dot(si2.n, direction),
-            dr.gather(Float, ends.density, suffix, active),
-            BLOCK,
-        )
-    ratio, retro = None, None
+        lit = lit_density(dr.gather(Float, ends.density, suffix, active), distance2, dr.dot(si2.n, direction))
+        if filtered:
+            diffuse = diffuse_fraction(world, si1, direction, value1[0], active)
+            value2 *= mis_weight_filtered(diffuse, dr.dot(si1.sh_frame.n, direction), lit, BLOCK)
+        else:
+            value2 *= mis_weight_bsdf(BLOCK * density1, lit)
+    at_x1, ratio, retro = None, None, None
     if has_retro_paths(world):
         retro = retro_ratio(world, si1, si2.p, si2.to_world(onward), density3, going)
     if has_light_paths(world):
-        ratio = ratio_at_camera(world, si1, direction, active, density1)
-        value2 *= camera_share(ratio * ratio_at_laser(world, si2, -direction, active))
-        ratio = finite_ratio(ratio * reversal(si2, onward, density3, going))
+        at_x1 = ratio_at_camera(world, si1, direction, active, density1)
+        value2 *= camera_share(at_x1 * ratio_at_laser(world, si2, -direction, active))
+        ratio = finite_ratio(at_x1 * reversal(si2, onward, density3, going))
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
     density = dr.select(active, density1 * area, 0)
     onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)
     value = dr.select(active, reach * value2 * irradiance, 0)
+    seen = SeenVertex(si2, reach, at_x1, density3, active, going)
+    joined = None if ends.joined is None else joined_factors(world, ends.joined, suffix, seen)
     onward = dr.select(going, reach * value3[0], 0)
-    dr.eval(leg, value, onward, ratio, retro, density, onward_density)
-    return leg, value, onward, ratio, retro, dr.block_sum(density, BLOCK), dr.block_sum(onward_density, BLOCK)
+    joined_density = None if joined is None else dr.select(joined.value > 0, density, 0)
+    dr.eval(leg, value, onward, ratio, retro, density, onward_density, joined and tuple(joined), joined_density)
+    sums = (None if part is None else dr.block_sum(part, BLOCK) for part in (density, onward_density, joined_density))
+    return leg, value, onward, ratio, retro, None if joined is None else tuple(joined), *sums
 
 
 class _Weights(NamedTuple):
-    """Weighted connections of every pair: leg from x1 to x2 [m], radiance of x2's laser light, factor of the light from
-    beyond x2, and the ratio of x1 with x2, and `retro_ratio` of what follows, or None."""
+    """Weighted connections of every pair: leg from x1 to x2 [m], radiance of x2's laser light and factor of the light
+    from beyond x2; the ratio of x1 with x2, `retro_ratio` of what follows, and factors of joined vertices, or None."""
 
     leg: Floats
     first: UInts
     onward: Masks
     ratio: Floats
     retro: Floats
+    joined: JoinedFactors | None
 
 
 def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
     primary, suffixes = paths.primary, paths.suffixes
-    ends = _Ends(
+    ends = _Ends(  # type: ignore[call-arg]
         parts_of(primary.si),
         primary.transmission,
         primary.allows_reuse,
         parts_of(suffixes.si),
-        *(getattr(suffixes, name) for name in _Ends._fields[4:]),
+        *(getattr(suffixes, name) for name in _Ends._fields[4:-1]),
+        None if suffixes.joined is None else tuple(suffixes.joined[:4]),
     )
     dr.eval(pairs.number)
-    made = _Connections(*world.recordings.call(world, "pairs", _connect, pairs.number, pairs.chosen, *ends))
-    density, onward_density = (dr.gather(Float, total, pairs.group) for total in (made.density, made.onward_density))
-    first = dr.select(density > 0, made.value / density, 0)
-    onward = dr.select(onward_density > 0, made.onward / onward_density, 0)
-    return _Weights(made.leg, first, onward, made.ratio, made.retro)
+    work = partial(_connect, filtered=primary.is_filtered)
+    key = "pairs", primary.is_filtered
+    made = _Connections(*world.recordings.call(world, key, work, pairs.number, pairs.chosen, *ends))
+
+    def weighted(value: Floats, total: Floats) -> Array:
+        density = dr.gather(Float, total, pairs.group)
+        return dr.select(density > 0, value / density, 0)
+
+    joined = None if made.joined is None else JoinedFactors(*made.joined)
+    if joined is not None:
+        joined = joined._replace(value=weighted(joined.value, made.joined_density))
+    first, onward = weighted(made.value, made.density), weighted(made.onward, made.onward_density)
+    return _Weights(made.leg, first, onward, made.ratio, made.retro, joined)
 
 
 def pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
@@ -250,13 +272,14 @@ def pair_lanes(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Lanes:
         weights.onward,
         weights.ratio,
         weights.retro,
+        weights.joined,
     )
 
 
 def own_lanes(paths: PathBatch) -> _Lanes:
     """Return light that a pixel gets from its own path alone."""
     primary, suffixes = paths.primary, paths.suffixes
-    suffix = dr.arange(UInt32, dr.width(paths.batch))
+    suffix, joined = dr.arange(UInt32, dr.width(paths.batch)), suffixes.joined
     return _Lanes(
         primary.receiver,
         paths.batch,
@@ -268,13 +291,15 @@ def own_lanes(paths: PathBatch) -> _Lanes:
         suffixes.own_onward,
         suffixes.own_ratio,
         suffixes.own_retro,
+        None if joined is None else JoinedFactors(joined.own_value, joined.own_ratio, joined.own_weight),
     )
 
 
 class _Lanes(NamedTuple):
     """Contributions of lanes: pixel and batch; suffix; paths from camera to x1 and on to x2; path from the laser up to
     which light is reused; radiance of x2's laser light, factor of the light from beyond x2; the ratio of x1 with x2, or
-    None without light paths, and `retro_ratio` of what follows, or None without retro paths."""
+    None without light paths, `retro_ratio` of what follows, or None without retro paths, and factors of joined
+    vertices, or None without these."""
 
     receiver: UInts
     batch: UInts
@@ -286,6 +311,7 @@ class _Lanes(NamedTuple):
     onward: Masks
     ratio: Floats
     retro: Floats
+    joined: JoinedFactors | None
 
 
 @dr.syntax
@@ -299,21 +325,22 @@ def add_lanes(
     own: bool,
 ) -> None:
     """Add the light of lanes to sums; `own`: that of a pixel's own path, connected at its first vertices too."""
-    receiver, batch, suffix, path1, leg, early_m, first, onward, ratio, retro = lanes
+    receiver, batch, suffix, path1, leg, early_m, first, onward, ratio, retro, joined = lanes
     connections, suffixes = (*paths.connections, *paths.retro), paths.suffixes
     laser_path, last = (dr.gather(type(c), c, suffix) for c in (suffixes.laser_path, suffixes.length))
     stride = dr.opaque(UInt32, dr.width(paths.batch))
     step, total = dr.zeros(UInt32, dr.width(suffix)), dr.zeros(Float, dr.width(suffix))
     # x2's own light is the loop's first step: additions before a loop would cost a kernel of their own
-    going, connection_count = (first > 0) | (onward > 0), UInt32(0)
+    going, connection_count = (first > 0) | fills_slots(onward, joined, Bool(True)), UInt32(0)
     if dr.hint(own, mode="scalar"):
         going, connection_count = Bool(paths.primary.valid), UInt32(len(connections))
     while going:
         beyond = going & (step > connection_count)
         slot = (step - 1 - connection_count) * stride + suffix
-        later = onward * dr.gather(Float, suffixes.values, slot, beyond)
+        factor, with_ratio = slot_factors(onward, ratio, joined, step - connection_count)
+        later = factor * dr.gather(Float, suffixes.values, slot, beyond)
         if dr.hint(ratio is not None, mode="scalar"):
-            others = finite_ratio(ratio * dr.gather(Float, suffixes.ratios, slot, beyond))
+            others = finite_ratio(with_ratio * dr.gather(Float, suffixes.ratios, slot, beyond))
             if dr.hint(retro is not None, mode="scalar"):
                 others += dr.select(step == connection_count + 1, retro, 0)  # x3's light
             later *= camera_share(others)
@@ -326,7 +353,9 @@ def add_lanes(
                 radiance, path = dr.select(near, light.value, radiance), dr.select(near, light.path, path)
                 towards = dr.select(near, light.direction, towards)
                 diffuse = dr.select(near, light.diffuse, diffuse)
-            adding = going & ~((path < early_m) & dr.select(beyond, suffixes.onward, suffixes.reusable & (step == 0)))
+            at_x2 = (step == 0) | ((step == connection_count + 1) & (joined is not None))
+            handed_on = dr.select(at_x2, suffixes.reusable, beyond & suffixes.onward)
+            adding = going & ~((path < early_m) & handed_on)
             radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)
             if dr.hint(path_filter is not None, mode="scalar"):
                 sums.add_unfiltered(receiver, batch, path1 + path, radiance, going)
@@ -339,10 +368,7 @@ def add_lanes(
             adding = going & (path < early_m)
             radiance = sums.clamped(receiver, batch, path1 + path, radiance, going, adding)
         total += sums.add(receiver, batch, path1 + path, radiance, adding)
-        going &= (step < connection_count) | ((step < last + connection_count) & (onward > 0))
+        more = fills_slots(onward, joined, step == connection_count)
+        going &= (step < connection_count) | ((step < last + connection_count) & more)
         step += 1
     sums.add_total(receiver, batch, total)
-
-
-def _gather_vector(source: Array, index: UInts, active: Masks) -> Array:
-    return mi.Vector3f(*(dr.gather(Float, component, index, active) for component in source))

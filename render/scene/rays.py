@@ -52,6 +52,11 @@ def interaction_from_parts(parts: tuple[Array, ...]) -> Array:
     return few
 
 
+def gather_vector(source: Vectors, index: UInts, active: Masks) -> Array:
+    """Return the vectors with these numbers."""
+    return mi.Vector3f(*(dr.gather(Float, component, index, active) for component in source))
+
+
 def kept(si: Interactions) -> Array:
     """Return the interaction with what is needed of it alone: most of a launch's memory is interactions."""
     return interaction_from_parts(parts_of(si))

@@ -84,11 +84,12 @@ class TracedScene:
         self.shape_ids = np.array([int(dr.reinterpret_array(UInt32, mi.ShapePtr(m))[0]) for m in meshes.values()])
         self.solid_ior = self.table([m.ior if m.kind == "dielectric" else 0 for m in materials])
         self.thin_ior = self.table([m.ior if m.kind == "thindielectric" else 0 for m in materials])
-        self.has_rough_coats = any(m.kind == "roughplastic" for m in materials)
+        # what these reflect depends on where they are seen from
+        rough_lobes = [float(m.kind in ("roughplastic", "roughconductor")) for m in materials]
+        self.has_rough_lobes, self.rough_lobes = any(rough_lobes), self.table(rough_lobes)
         self.has_mixed_lobes = any(m.kind not in ("diffuse", "roughdiffuse") for m in materials)
         # paths that meet smooth plastic share none of it (`render.indirect.reuse`)
         self.allows_reuse = self.table([m.kind != "plastic" for m in materials])
-        self.rough_coats = self.table([m.kind == "roughplastic" for m in materials])
         self.albedo = self.table([_specular_albedo(m) for m in materials])
         # highlights that outshine paint and may be narrower than what a ray stands for (`render.direct.edges`)
         peaks = [_peak(m) for m in materials]

@@ -18,12 +18,16 @@ from scenes.geometry.shapes import box, sphere
 
 LAMP = Laser("flood", cone_deg=360)
 KINDS = ("diffuse", "plastic", "roughplastic", "roughconductor", "dielectric")
+VARNISHED = "varnished"  # walls and a metal ball: what x2 reflects of a light vertex depends on the pixel
 
 
 def room(kind: str = "diffuse", laser: Laser = LAMP, width: int = 12) -> Scene:
     vertices, faces, uv = box((4, 3, 5))
     walls = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.6), uv=uv)
     vertices, faces, _ = sphere(0.4, 3)
+    if kind == VARNISHED:
+        walls = replace(walls, material=Material("roughplastic", albedo=0.6, roughness=0.15))
+        kind = "roughconductor"
     options = {"ior": 1.5} if kind == "dielectric" else {"roughness": 0.2} if kind.startswith("rough") else {}
     ball = Surface(vertices + [0.4, -0.2, -1.6], faces, Material(kind, albedo=0.4, **options))
     return Scene("room", (walls, ball), oracles.camera(width, width, 60), laser)
@@ -52,7 +56,7 @@ class Sum:
 
 
 def totals(scene: Scene, seed: int, *, reuses_paths: bool, rounds: int = 64, from_m: float | None = None) -> np.ndarray:
-    """Radiance of indirect light in a view's blocks by every round: (rounds, blocks).
+    """Return radiance of indirect light in a view's pixels by every round: (rounds, pixels).
 
     Blocks share all of it, none, or what comes less than `from_m` behind direct light.
     """
@@ -64,13 +68,13 @@ def totals(scene: Scene, seed: int, *, reuses_paths: bool, rounds: int = 64, fro
     traced = trace_paths(PathTask(world, blocks, turns, 4, seed, reuses_paths=reuses_paths, from_m=start))
     own = Sum()
     sharing.add_lanes(sharing.own_lanes(traced), traced, own, own=True)
-    found = own.lanes.reshape(-1, BLOCK).sum(axis=1)
+    found = own.lanes
     pairs = sharing.select_pairs(traced, reuses_paths=reuses_paths, early=from_m is not None)
     if pairs is not None:
         of_pairs = Sum()
         sharing.add_lanes(sharing.pair_lanes(world, traced, pairs), traced, of_pairs, own=False)
-        np.add.at(found, pairs.vertex.numpy() // BLOCK, of_pairs.lanes)
-    return found.reshape(count, rounds).T
+        np.add.at(found, pairs.vertex.numpy(), of_pairs.lanes)
+    return found.reshape(count, rounds, BLOCK).swapaxes(0, 1).reshape(rounds, -1)
 
 
 def test_suffixes_without_light_are_left_out_of_pairs():
@@ -135,10 +139,10 @@ def test_joined_paths_carry_the_same_light_with_less_noise(kind, reuses_paths, m
     plain = totals(scene, 2, reuses_paths=reuses_paths, rounds=128)
     means, errors = zip(*((t.sum(1).mean(), t.sum(1).std() / np.sqrt(len(t))) for t in (joined, plain)), strict=True)
     assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
-    assert joined.var(axis=0).sum() < plain.var(axis=0).sum() / 1.5
+    assert joined.var(axis=0).sum() < plain.var(axis=0).sum() / 1.3  # of pixels
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "panel"])
+@pytest.mark.parametrize("kind", [*KINDS, VARNISHED, "panel"])
 def test_shared_paths_carry_the_light_of_own_ones(kind):
     """The same, by the same joined paths: also before a panel whose two sides the heads of one block may see.
 
@@ -149,8 +153,9 @@ def test_shared_paths_carry_the_light_of_own_ones(kind):
         corners = np.array([(-1, -0.6, -1.5), (1, -0.6, -1.5), (1, -0.6, -3), (-1, -0.6, -3)])
         coated = Material("roughplastic", albedo=0.5, roughness=0.3)
         scene = replace(scene, surfaces=(scene.surfaces[0], Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), coated)))
-    own, split = (totals(scene, 1, reuses_paths=reused, rounds=512).sum(axis=1) for reused in (False, True))
-    error = np.hypot(own.std(), split.std()) / np.sqrt(512)
+    rounds = 1024 if kind == VARNISHED else 512
+    own, split = (totals(scene, 1, reuses_paths=reused, rounds=rounds).sum(axis=1) for reused in (False, True))
+    error = np.hypot(own.std(), split.std()) / np.sqrt(rounds)
     assert abs(own.mean() - split.mean()) < 4 * error and error < 0.004 * own.mean()
 
 
@@ -189,7 +194,21 @@ def test_a_laser_that_moves_has_no_lit_points(mode):
     assert lit.connections_per_vertex(wide, reuses_paths=False) > lit.connections_per_vertex(narrow, reuses_paths=False)
 
 
-def test_shares_are_whole_and_stay_finite():
+@pytest.mark.parametrize(("reuses_paths", "gain"), [(False, 30), (True, 4)])
+def test_light_from_close_to_a_lamp_is_even_on_varnish(reuses_paths, gain, monkeypatch):
+    """A small ball close to the lamp lights varnished walls and metal, which paths by chance find seldom."""
+    scene = room(VARNISHED)
+    vertices, faces, _ = sphere(0.05, 2)
+    scene = replace(scene, surfaces=(*scene.surfaces, Surface(vertices + [0, 0, 0.12], faces, Material(albedo=0.8))))
+    joined = totals(scene, 1, reuses_paths=reuses_paths, rounds=256)
+    monkeypatch.setattr(paths, "connections_per_vertex", lambda world, reuses_paths: 0)
+    plain = totals(scene, 2, reuses_paths=reuses_paths, rounds=256)
+    errors = (t.sum(1).std() / np.sqrt(len(t)) for t in (joined, plain))
+    assert abs(joined.sum(1).mean() - plain.sum(1).mean()) < 4 * np.hypot(*errors)
+    assert joined.var(axis=0).sum() < plain.var(axis=0).sum() / gain
+
+
+def test_weights_are_whole_and_stay_finite():
     """What joining has and what chance keeps add up to 1, also where points touch or are seen edge-on."""
     for cosine, distance2, far, density in (
         (0.5, 2.0, 0.3, 0.1),
@@ -197,11 +216,12 @@ def test_shares_are_whole_and_stay_finite():
         (1, 0, 1, 1),
         (1, 1, 0, 1),
         (1, 1, 1, 0),
+        (0, 0, 1, 1),
     ):
-        values = (Float(float(value)) for value in (cosine, distance2, far, density))
-        lobes, both = lit.densities(*values, 4)
-        kept = lit.mis_weight_bsdf(1, Float(float(cosine)), Float(float(distance2)), Float(float(far)),
-                                   Float(float(density)), 4)  # fmt: skip
-        assert 0 <= kept[0] <= 1 and np.isfinite(kept[0])
-        if both[0] > 0:
-            assert kept[0] == pytest.approx(lobes[0] / both[0], abs=1e-6)
+        lobes = Float(4 / np.pi * cosine)
+        lit_there = lit.lit_density(Float(float(density)), Float(float(distance2)), Float(float(far)))
+        kept = lit.mis_weight_bsdf(lobes, lit_there)[0]
+        assert 0 <= kept <= 1 and np.isfinite(kept)
+        assert lit.mis_weight_filtered(Float(1), Float(float(cosine)), lit_there, 4)[0] == pytest.approx(kept, abs=1e-6)
+        if lobes[0] + lit_there[0] > 0:
+            assert kept == pytest.approx(lobes[0] / (lobes[0] + lit_there[0]), abs=1e-6)
