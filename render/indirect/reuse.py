@@ -43,7 +43,7 @@ from render.indirect.retro_paths import has_retro_paths, retro_ratio
 from render.scene.rays import gather_vector, interaction_from_parts, parts_of, segment, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
-# Of one launch, 30 and 75 MB in its course.
+# Of one launch, 30 and 75 MB in its course; 40 MB more under a lamp, where x2 is joined.
 CONNECTIONS_PER_LAUNCH = 3 << 18  # connections
 PATHS_PER_LAUNCH = 1 << 18
 FILTERED_PATHS_PER_LAUNCH = 13 << 12  # which may have connections, too
