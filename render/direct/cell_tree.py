@@ -143,8 +143,7 @@ class CellTree:
         bits, *found = first_edges(cells, path_intervals, self.grid, of_image, float(self.least))
         for interval, new in zip(path_intervals, found, strict=True):
             interval[:] = new
-        self.mixed[self.rank[_having(bits, MIXED)]] = True
-        return _having(bits, CUT | GLINT)
+        return self._note(bits)[0]
 
     def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
         """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""
@@ -161,10 +160,17 @@ class CellTree:
         cells = Cells(*(getattr(self, name) for name in Cells._fields))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
         bits = child_edges(tree, places, cells, parents, float(self.least))[: self.used]
-        self.mixed[self.rank[_having(bits, MIXED)]] = True
-        marked = _having(bits, CUT | GLINT)
-        deepest = np.where(bits[marked] & GLINT, levels + GLINT_LEVELS, levels)
+        marked, why = self._note(bits)
+        deepest = np.where(why & GLINT, levels + GLINT_LEVELS, levels)
         return marked[(self.child[marked] < 0) & (self.level[marked] < deepest)]
+
+    def _note(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Note which pixels are mixed; return the cells to cut, sorted, and their bits."""
+        cells = np.flatnonzero(bits != 0)  # most have none, and one pass over all is enough
+        found = bits[cells]
+        self.mixed[self.rank[cells[(found & MIXED) != 0]]] = True
+        cut = (found & (CUT | GLINT)) != 0
+        return cells[cut], found[cut]
 
 
 def _having(bits: np.ndarray, wanted: int) -> np.ndarray:
