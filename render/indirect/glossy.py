@@ -47,7 +47,7 @@ from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, 
 
 RATIO = 1.0  # paths that begin in a polished pixel of the laser's image, for every path of others (1 to 2 do best)
 # Pixels that use a path from the camera, as the weights count them. In a varnished hall 8 has half the squared error of
-# 1, shared or filtered, and no fireflies; 4 and 16 do nearly as well.
+# 1, shared or filtered, and 4 and 16 do nearly as well; between narrow lobes, which few pixels share, 1 is better.
 SERVED = 8.0
 MAX_LIGHT_PATHS = 2.0  # for every path from the camera (1 to 4 do as well in a varnished hall under a lamp)
 # Where SEEN_BY x SEEN_BY rays a pixel meet no polished surface there may be a sliver: the share that begins there.
