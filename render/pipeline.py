@@ -40,7 +40,7 @@ MAX_SPP, MAX_SPP_BY_DEFAULT = 16384, 1024
 # Beyond so many times the work that a plan may spend, or that it planned, a target is not chased.
 HOPELESS = 10
 PROPOSAL = "trade fireflies for a stated bias with --clamp 10"
-UNEVEN = 1e-3  # of the direct light's root sum square over pixels: what one pixel's mirrored light may be off by
+UNEVEN = 1e-3  # of the light's root sum square over pixels: what mirrored light may be off by
 MIN_BATCHES = 2  # whose difference tells the noise
 FEWEST_ALLOCATED = 2 * BATCHES  # forced paths a pixel from which on a pilot pays, and blocks can share
 FIRST_FILTERED_SPP = 16  # filtered light starts with few paths, whatever it needs
@@ -124,7 +124,7 @@ def trace(
     trim = partial(trim_memory, len(pixels)) if plan.bounces > 1 else lambda: None
     trim()
     radiance = np.bincount(direct.samples.pixel, weights=direct.samples.radiance, minlength=len(pixels))
-    uneven = UNEVEN * float(np.linalg.norm(radiance))
+    uneven = UNEVEN, float(np.linalg.norm(radiance))
     # the image method finds light of more surfaces than asked for, too
     most = MAX_BOUNCES if settings.bounces is None else settings.bounces
     specular = specular_light(world, plan.grid, plan.direct_tolerance_m, uneven, most)

@@ -28,6 +28,7 @@ from render.indirect.launch_layout import (
 )
 from render.indirect.light_vertices import (
     Connection,
+    JoinedVertex,
     LightVertices,
     Scattered,
     connections_per_vertex,
@@ -35,10 +36,11 @@ from render.indirect.light_vertices import (
     sample_light_vertices,
 )
 from render.indirect.path_space_filter import Point, late_from, point_of
-from render.indirect.path_suffixes import JoinedVertex, PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
+from render.indirect.path_suffixes import PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
 from render.indirect.primary_vertices import PrimaryVertices, connect_primary_vertices, reuses_early_paths
 from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, kept, parts_of, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
+from render.specular.mirrors import plane_metal
 
 PLAIN_GOLDEN = 2654435769  # bits of the golden ratio, in units of 2^-32
 
@@ -81,7 +83,7 @@ class PathTask(NamedTuple):
 def trace_paths(task: PathTask) -> PathBatch:
     """Trace the camera paths of one launch, and connect their vertices to light vertices."""
     world, pixels, launch, bounces, seed, batches, reuses_paths, from_m = task
-    glossy_of(world)  # looked for before anything is recorded
+    glossy_of(world), plane_metal(world)  # looked for before anything is recorded
     members = traced_members(pixels, shared=reuses_paths or from_m is not None)
     lanes = len(launch.block) * members
     seeds = np.random.SeedSequence(seed).generate_state(4)

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Interactions, LobeSamples, Masks, UInts, Vectors
-from render.indirect.glossy import has_light_paths, ratio_at_laser
+from render.indirect.glossy import finite_ratio, has_light_paths, ratio_at_laser, reversal
 from render.scene.rays import (
     TOUCHING,
     first_opaque,
@@ -31,6 +31,7 @@ from render.scene.rays import (
     laser_light,
     parts_of,
     segment,
+    shape_index,
     spawn,
     to_world,
 )
@@ -262,3 +263,76 @@ def connect_to_light_vertex(
     ratio = ratio_at_laser(world, end, -direction, active) if has_light_paths(world) else None
     light = dr.select(active & dr.isfinite(light * passed), light * passed, 0)
     return Arrival(light, path, direction, density, value, lobes, ratio)
+
+
+class JoinedVertex(NamedTuple):
+    """x2 joined to a light vertex, where what it reflects of that depends on where it is seen from.
+
+    The first slot of `PathSuffixes` then holds what arrives at x2 from the light vertex, and every pixel reflects it
+    as it sees x2; the second slot holds all of x3's laser light, which every pixel weights by `mis_weight_bsdf`.
+
+    direction             from x2 to the light vertex
+    density               of light vertices per solid angle in that direction
+    onward_density        the same in the direction to x3
+    reflected             what x2 makes of that light as the pixel itself sees it: what all do where x2 is diffuse
+    own_value, own_ratio  the pixel's own factor of the first slot, and of the ratio there or None
+    own_weight            the pixel's own weight of the second slot
+    """
+
+    direction: Vectors
+    density: Floats
+    onward_density: Floats
+    reflected: Floats
+    own_value: Floats
+    own_ratio: Floats
+    own_weight: Floats
+
+
+class JoinedFactors(NamedTuple):
+    """Factors of light that comes by `JoinedVertex`: of the first slot, of its ratio or None, and of the second slot
+    beside the factor of all light from beyond x2."""
+
+    value: Floats
+    ratio: Floats
+    weight: Floats
+
+
+class SeenVertex(NamedTuple):
+    """x2 as x1 of any pixel of the block sees it: factor of light from there, `ratio_at_camera` of x1 or None, density
+    of the lobes of x2 towards x3; where it is seen, and where the path goes on."""
+
+    si: Interactions
+    reach: Floats
+    at_x1: Floats
+    onward_density: Floats
+    active: Masks
+    going: Masks
+
+
+def joined_factors(world: TracedScene, joined: tuple[Array, ...], suffix: UInts, seen: SeenVertex) -> JoinedFactors:
+    """Return the factors of suffixes, given the first four parts of `JoinedVertex`, for the pixels that have `seen` x2;
+    the value before division by a density."""
+    direction, density, onward_density, reflected = joined
+    rough = seen.active & (dr.gather(Float, world.rough_lobes, shape_index(seen.si), seen.active) > 0)
+    towards = seen.si.to_local(gather_vector(direction, suffix, rough))
+    value, lobes = reflect(seen.si, towards, rough)
+    value /= lobes + dr.gather(Float, density, suffix, rough)
+    value = seen.reach * dr.select(rough, value, dr.gather(Float, reflected, suffix, seen.active))
+    turned = dr.select(rough, reversal(seen.si, towards, lobes, rough), 1) if seen.at_x1 is not None else None
+    weight = mis_weight_bsdf(seen.onward_density, dr.gather(Float, onward_density, suffix, seen.going))
+    value = dr.select(seen.active & dr.isfinite(value), value, 0)
+    return JoinedFactors(value, None if turned is None else finite_ratio(seen.at_x1 * turned), weight)
+
+
+def slot_factors(onward: Floats, ratio: Floats, joined: JoinedFactors | None, number: UInts) -> tuple[Array, Array]:
+    """Return the factors of a slot's light and of its ratio, from those of all light from beyond x2; slots are numbered
+    from 1."""
+    if joined is None:
+        return onward, ratio
+    factor = dr.select(number == 1, joined.value, dr.select(number == 2, onward * joined.weight, onward))
+    return factor, None if ratio is None else dr.select(number == 1, joined.ratio, ratio)
+
+
+def fills_slots(onward: Floats, joined: JoinedFactors | None, before_first: Masks) -> Array:
+    """Return whether a slot that follows has light: the first of a joined x2 has if nothing comes from beyond, too."""
+    return onward > 0 if joined is None else (onward > 0) | (before_first & (joined.value > 0))

@@ -17,6 +17,7 @@ from render.indirect.glossy import (
 from render.indirect.light_vertices import (
     Arrival,
     Connection,
+    JoinedVertex,
     LightVertices,
     Scattered,
     connect_to_light_vertex,
@@ -24,61 +25,16 @@ from render.indirect.light_vertices import (
     density_of,
     light_vertex_index,
     lit_density,
-    mis_weight_bsdf,
     mis_weight_sampled,
     mis_weight_sampled_filtered,
-    reflect,
 )
 from render.indirect.primary_vertices import PrimaryVertices, sampling_techniques
 from render.indirect.retro_paths import ReachedVertex, connect_retro
-from render.scene.rays import first_opaque, gather_vector, kept, laser_light, sample_bsdf, shape_index, spawn
+from render.scene.rays import first_opaque, kept, laser_light, sample_bsdf, shape_index, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
+from render.specular.mirrors import is_mirrored_light, mirrors_in_row, plane_metal
 
 MIN_REVERSAL = 1e-12  # of x2, by which is divided
-
-
-class JoinedVertex(NamedTuple):
-    """x2 joined to a light vertex, where what it reflects of that depends on where it is seen from.
-
-    The first slot of `PathSuffixes` then holds what arrives at x2 from the light vertex, and every pixel reflects it
-    as it sees x2; the second slot holds all of x3's laser light, which every pixel weights by `mis_weight_bsdf`.
-
-    direction             from x2 to the light vertex
-    density               of light vertices per solid angle in that direction
-    onward_density        the same in the direction to x3
-    reflected             what x2 makes of that light as the pixel itself sees it: what all do where x2 is diffuse
-    own_value, own_ratio  the pixel's own factor of the first slot, and of the ratio there or None
-    own_weight            the pixel's own weight of the second slot
-    """
-
-    direction: Vectors
-    density: Floats
-    onward_density: Floats
-    reflected: Floats
-    own_value: Floats
-    own_ratio: Floats
-    own_weight: Floats
-
-
-class JoinedFactors(NamedTuple):
-    """Factors of light that comes by `JoinedVertex`: of the first slot, of its ratio or None, and of the second slot
-    beside the factor of all light from beyond x2."""
-
-    value: Floats
-    ratio: Floats
-    weight: Floats
-
-
-class SeenVertex(NamedTuple):
-    """x2 as x1 of any pixel of the block sees it: factor of light from there, `ratio_at_camera` of x1 or None, density
-    of the lobes of x2 towards x3; where it is seen, and where the path goes on."""
-
-    si: Interactions
-    reach: Floats
-    at_x1: Floats
-    onward_density: Floats
-    active: Masks
-    going: Masks
 
 
 class PathSuffixes(NamedTuple):
@@ -190,7 +146,8 @@ def trace_suffixes(
         at_x1 = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
         at_x2 = dr.maximum(finite_ratio(reversal_of_sample(si, onward, alive)), MIN_REVERSAL)
         value *= camera_share(at_x1 * ratio_at_laser(world, si, -direction, readable))
-    value = dr.select(alive & dr.isfinite(value), own * value, 0)
+    mirrors = mirrors_in_row(world, x1, UInt32(0), alive)
+    value = dr.select(alive & dr.isfinite(value) & ~is_mirrored_light(mirrors), own * value, 0)
     goes_on = alive & (task.slots.count > 0)  # x3 is a surface more
     reached = ReachedVertex(x1, sample, own, at_x1, leg, si, readable & goes_on)
     own_retro, back = connect_retro(world, reached, onward, pixel, random)
@@ -198,7 +155,8 @@ def trace_suffixes(
     soonest = dr.select(alive & (irradiance > 0), laser_path, dr.inf)
     joined = reused and world.has_rough_lobes and _connects_suffix(world, light_vertices)
     unit, at_sample = (Float(1), Float(1)) if joined else (1 / scale, at_x2)
-    state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, unit, at_sample)
+    mirrors = mirrors_in_row(world, si, mirrors, alive)
+    state = _SuffixState(kept(si), onward, onward_weight, onward_weight / scale, unit, at_sample, mirrors)
     *light, (towards, lit, reflected, turned), (onward_lit, own_weight) = _trace_suffix(
         world, task, state, goes_on, soonest, joined=joined
     )
@@ -248,7 +206,8 @@ class _SuffixState(NamedTuple):
     """Current vertices of paths and their continuation: a sample of the surface's lobes and its weight.
 
     `throughput` is the factor of light that comes from there, `throughput_at_vertex` that of light reflected on the
-    spot, reflectance counted in that light. `reversal` is that of the sample, which is no part of the ratios beyond.
+    spot, reflectance counted in that light. `reversal` is that of the sample, which is no part of the ratios beyond,
+    and `mirrors` the number of `mirrors_in_row`.
     """
 
     si: Interactions
@@ -257,6 +216,7 @@ class _SuffixState(NamedTuple):
     throughput: Floats
     throughput_at_vertex: Floats
     reversal: Floats
+    mirrors: UInts
 
 
 @dr.syntax
@@ -279,6 +239,7 @@ def _trace_suffix(
     active = Bool(active) & (slot < last)
     # factors of the vertices between x2 and the current one, of the current one, and what a connection leaves out
     ratio, step, given = dr.full(Float, 1, lanes), dr.full(Float, 1, lanes), state.reversal + dr.zeros(Float, lanes)
+    mirrors = state.mirrors + dr.zeros(UInt32, lanes)
     x2, x3 = (dr.zeros(mi.Vector3f, lanes), *(dr.zeros(Float, lanes),) * 3), (dr.zeros(Float, lanes),) * 2
     while active:
         first = slot == 0
@@ -305,6 +266,9 @@ def _trace_suffix(
             if dr.hint(joined, mode="scalar"):
                 x3, by_chance = _where(first, (lit, by_chance), x3), dr.select(first, 1, by_chance)
             light *= by_chance
+        if dr.hint(plane_metal(world) is not None, mode="scalar"):
+            light = dr.select(is_mirrored_light(mirrors), 0, light)
+            mirrors = mirrors_in_row(world, si, mirrors, active)
         throughput_at_vertex = throughput * passed
         ratio, given = finite_ratio(ratio * step), Float(1)
         vertex = light * throughput_at_vertex, path + leg, _ratio_at_end(world, si, -towards.d, ratio, active)
@@ -366,32 +330,3 @@ def _put(slots: Slots, place: UInts, vertex: tuple[Floats, Floats, Floats], soon
     if ratio is not None:
         dr.scatter(slots.ratios, ratio, place, active)
     return dr.select(active & (light > 0), dr.minimum(soonest, path), soonest)
-
-
-def joined_factors(world: TracedScene, joined: tuple[Array, ...], suffix: UInts, seen: SeenVertex) -> JoinedFactors:
-    """Return the factors of suffixes, given the first four parts of `JoinedVertex`, for the pixels that have `seen` x2;
-    the value before division by a density."""
-    direction, density, onward_density, reflected = joined
-    rough = seen.active & (dr.gather(Float, world.rough_lobes, shape_index(seen.si), seen.active) > 0)
-    towards = seen.si.to_local(gather_vector(direction, suffix, rough))
-    value, lobes = reflect(seen.si, towards, rough)
-    value /= lobes + dr.gather(Float, density, suffix, rough)
-    value = seen.reach * dr.select(rough, value, dr.gather(Float, reflected, suffix, seen.active))
-    turned = dr.select(rough, reversal(seen.si, towards, lobes, rough), 1) if seen.at_x1 is not None else None
-    weight = mis_weight_bsdf(seen.onward_density, dr.gather(Float, onward_density, suffix, seen.going))
-    value = dr.select(seen.active & dr.isfinite(value), value, 0)
-    return JoinedFactors(value, None if turned is None else finite_ratio(seen.at_x1 * turned), weight)
-
-
-def slot_factors(onward: Floats, ratio: Floats, joined: JoinedFactors | None, number: UInts) -> tuple[Array, Array]:
-    """Return the factors of a slot's light and of its ratio, from those of all light from beyond x2; slots are numbered
-    from 1."""
-    if joined is None:
-        return onward, ratio
-    factor = dr.select(number == 1, joined.value, dr.select(number == 2, onward * joined.weight, onward))
-    return factor, None if ratio is None else dr.select(number == 1, joined.ratio, ratio)
-
-
-def fills_slots(onward: Floats, joined: JoinedFactors | None, before_first: Masks) -> Array:
-    """Return whether a slot that follows has light: the first of a joined x2 has if nothing comes from beyond, too."""
-    return onward > 0 if joined is None else (onward > 0) | (before_first & (joined.value > 0))

@@ -31,13 +31,17 @@ from render.indirect.glossy import (
 )
 from render.indirect.launch_layout import BLOCK
 from render.indirect.light_vertices import (
+    JoinedFactors,
+    SeenVertex,
     diffuse_fraction,
+    fills_slots,
+    joined_factors,
     lit_density,
     mis_weight_bsdf,
     mis_weight_filtered,
+    slot_factors,
 )
 from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
-from render.indirect.path_suffixes import JoinedFactors, SeenVertex, fills_slots, joined_factors, slot_factors
 from render.indirect.primary_vertices import reuses_early_paths
 from render.indirect.retro_paths import has_retro_paths, retro_ratio
 from render.scene.rays import gather_vector, interaction_from_parts, parts_of, segment, spawn

@@ -101,6 +101,7 @@ class TracedScene:
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})
         self.solid_index = dr.opaque(Float, max(self.solid_indices, default=1.0))
         self.refracts = False  # `render.scene.refraction`
+        self.plane_metal: Any = None  # `render.specular.mirrors.plane_metal`
         self.recordings = Recordings()
         self._bind_camera(scene)
 

@@ -10,9 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.scene.rays import TOUCHING
-from render.scene.traced_scene import TracedScene
+from render.backend.drjit_types import Array, Interactions, Masks, UInts
+from render.scene.rays import TOUCHING, shape_index
+from render.scene.traced_scene import Float, TracedScene, UInt32, dr
 from scenes.errors import listed, require
+from scenes.geometry.bodies import visible_sides
+from scenes.geometry.shapes import axis_frame
 from scenes.model import Surface
 
 MAX_ORDER = 3  # mirrors in a row
@@ -28,13 +31,17 @@ COATED = ("conductor", "plastic", "dielectric", "thindielectric")
 class Mirrors(NamedTuple):
     """Plane smooth faces n . x = c, the camera at the origin, (n,) or (n, 3) each.
 
-    `low` and `high` bound the face; `shape` is its mesh's registered index; `is_metal` and `is_solid` its material.
+    `low` and `high` bound the face, and so do the `corners` (n, 4, 3) of a rectangle in its plane. `sides` (n, 2) are
+    those before and behind it that the laser's light may reach; `shape` is its mesh's registered index; `is_metal` and
+    `is_solid` its material.
     """
 
     normal: np.ndarray
     offset: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    corners: np.ndarray
+    sides: np.ndarray
     shape: np.ndarray
     is_metal: np.ndarray
     is_solid: np.ndarray
@@ -53,6 +60,7 @@ class SlabError(NamedTuple):
 def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
     """Return all plane smooth faces of a scene, and notes that name the smooth surfaces that are curved."""
     rows, notes = [], []
+    laser = world.scene.laser.position(world.scene.camera)
     curved: dict[str, None] = {}
     for shape, group in zip(world.shape_ids, world.groups, strict=True):
         kind = group[0].material.kind
@@ -60,7 +68,7 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
             continue
         planes: list[tuple] = []
         for surface in group:
-            found = planes_of(surface, world.scene.camera.origin)
+            found = planes_of(surface, world.scene.camera.origin, laser)
             if found is None:
                 curved.setdefault(surface.name, None)
             for plane in found or ():
@@ -75,20 +83,19 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
         notes.append("glass: its own return is rendered; other light that it reflects is left out")
     if "plastic" in kinds:
         notes.append("smooth plastic: the laser's glint in its coat is rendered, not what is lit by way of the coat")
-    if any(row[5] for row in rows):
+    if any(row[7] for row in rows):
         notes.append("mirrors: light by way of them that meets two or more other surfaces first is left out")
-    columns: list = (
-        list(zip(*rows, strict=True)) if rows else [np.empty((0, 3)), [], np.empty((0, 3)), np.empty((0, 3))]
-    )
-    columns += [[]] * (7 - len(columns))
-    types = (float, float, float, float, np.int64, bool, bool)
+    of_none = [np.empty((0, *shape)) for shape in ((3,), (), (3,), (3,), (4, 3), (2,), (), (), ())]
+    columns: list = list(zip(*rows, strict=True)) if rows else of_none
+    types = (float, float, float, float, float, bool, np.int64, bool, bool)
     return Mirrors(*(np.array(c, dtype=t) for c, t in zip(columns, types, strict=True))), notes
 
 
-def planes_of(surface: Surface, origin: np.ndarray) -> list[tuple] | None:
-    """Return planes (normal, offset, low, high) of a mesh relative to `origin`; None for a curved one.
+def planes_of(surface: Surface, origin: np.ndarray, laser: np.ndarray | None = None) -> list[tuple] | None:
+    """Return planes (normal, offset, low, high, corners, sides) of a mesh relative to `origin`; None for a curved one.
 
-    Triangles without area do not count.
+    Triangles without area do not count. `sides` are those before and behind a plane that light of a `laser` may reach,
+    by which bodies are closed; both without it.
     """
     corners = (surface.vertices - origin)[surface.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -100,15 +107,17 @@ def planes_of(surface: Surface, origin: np.ndarray) -> list[tuple] | None:
         flat = np.abs(np.einsum("fcj,fj->fc", shading, normal)) > (1 - 1e-5) * area[:, None]
         if not flat[kept].all():
             return None
-    order = np.argsort(-area[kept], kind="stable")
-    corners, normal = corners[kept][order], (normal[kept] / area[kept, None])[order]
+    order = np.flatnonzero(kept)[np.argsort(-area[kept], kind="stable")]
+    corners, normal = corners[order], normal[order] / area[order, None]
     # a curved mesh shows in its largest faces already: no need to look for planes among a million
-    if len(corners) > 256 and _cluster(corners[:256], normal[:256]) is None:
+    if len(corners) > 256 and _cluster(corners[:256], normal[:256], np.zeros(256)) is None:
         return None
-    return _cluster(corners, normal)
+    if laser is None or surface.material.has_holes:
+        return _cluster(corners, normal, np.zeros(len(corners)))
+    return _cluster(corners, normal, visible_sides(surface.vertices, surface.faces, laser)[order])
 
 
-def _cluster(corners: np.ndarray, normal: np.ndarray) -> list[tuple] | None:
+def _cluster(corners: np.ndarray, normal: np.ndarray, side: np.ndarray) -> list[tuple] | None:
     planes: list[tuple] = []
     while len(corners):
         if len(planes) == MAX_PLANES:
@@ -119,20 +128,61 @@ def _cluster(corners: np.ndarray, normal: np.ndarray) -> list[tuple] | None:
         same = close & (np.abs(normal @ n) > 1 - 1e-6)
         same[0] = True
         points = corners[same].reshape(-1, 3)
-        planes.append((n, c, points.min(axis=0), points.max(axis=0)))
-        corners, normal = corners[~same], normal[~same]
+        seen = side[same] * np.sign(normal[same] @ n)
+        sides = np.array((np.any(seen >= 0), np.any(seen <= 0)))
+        planes.append((n, c, points.min(axis=0), points.max(axis=0), _rectangle(n, c, points), sides))
+        corners, normal, side = corners[~same], normal[~same], side[~same]
     return planes
 
 
 def _add_plane(planes: list[tuple], plane: tuple) -> None:
     """Append a plane, or widen an equal one: two surfaces of one material in one plane give one glint."""
-    normal, offset, low, high = plane
-    for i, (n, c, a, b) in enumerate(planes):
+    normal, offset, low, high, corners, sides = plane
+    for i, (n, c, a, b, before, sides_before) in enumerate(planes):
         sign = np.sign(n @ normal)
         if abs(n @ normal) > 1 - 1e-9 and abs(sign * offset - c) < 2e-6 * max(np.abs(b).max(), np.abs(a).max()):
-            planes[i] = (n, c, np.minimum(a, low), np.maximum(b, high))
+            both = _rectangle(n, c, np.concatenate((before, corners)))
+            sides = sides_before | (sides if sign > 0 else sides[::-1])
+            planes[i] = (n, c, np.minimum(a, low), np.maximum(b, high), both, sides)
             return
     planes.append(plane)
+
+
+def _rectangle(normal: np.ndarray, offset: float, points: np.ndarray) -> np.ndarray:
+    """Return the corners (4, 3) of a rectangle in the plane normal . x = offset around points on it."""
+    across = axis_frame(normal)[:, :2]
+    low, high = (points @ across).min(axis=0), (points @ across).max(axis=0)
+    return offset * normal + np.array([(a, b) for a in (low[0], high[0]) for b in (low[1], high[1])]) @ across.T
+
+
+def plane_metal(world: TracedScene) -> Array | None:
+    """Return which registered shapes are metal in planes alone, 1 or 0 each, looked for once; None without any.
+
+    A mesh that has a curved surface, too, shows no flat image.
+    """
+    if world.plane_metal is None:
+        flat = [
+            group[0].material.kind == "conductor"
+            and all(s.normals is None or planes_of(s, s.vertices[0]) is not None for s in group)
+            for group in world.groups
+        ]
+        world.plane_metal = world.table([float(metal) for metal in flat]) if any(flat) else ()
+    return None if isinstance(world.plane_metal, tuple) else world.plane_metal
+
+
+def mirrors_in_row(world: TracedScene, si: Interactions, before: UInts, active: Masks) -> Array:
+    """Return how many plane mirrors a path from the camera has met up to this surface, `before` it and with it; more
+    than MAX_ORDER from the first other surface on."""
+    metal = plane_metal(world)
+    if metal is None:
+        return UInt32(MAX_ORDER + 1)
+    met = active & (dr.gather(Float, metal, shape_index(si), active) > 0)
+    return dr.select(met, before + 1, MAX_ORDER + 1)
+
+
+def is_mirrored_light(mirrors: UInts) -> Array:
+    """Return whether laser light at the next surface is traced by `render.specular`: so many mirrors lead there."""
+    return mirrors <= MAX_ORDER
 
 
 def lit_mirrors(world: TracedScene, mirrors: Mirrors) -> np.ndarray:
@@ -145,33 +195,53 @@ def lit_mirrors(world: TracedScene, mirrors: Mirrors) -> np.ndarray:
 def glint_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
     """Return mirrors in a row, (m, k) plane indices for k = 1, 2, 3. Solid glass, which refracts, stands alone."""
     found = [np.arange(len(mirrors.offset))[:, None]] if len(mirrors.offset) else []
-    return found + _longer(np.flatnonzero(~mirrors.is_solid), MAX_SEQUENCES, notes, "glints")
-
-
-def image_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
-    """Return sequences (k,) of metal mirrors that light the scene, the shorter ones first."""
-    metal = np.flatnonzero(mirrors.is_metal)
-    if len(metal) > MAX_IMAGES:
-        notes.append(f"mirrors: {len(metal) - MAX_IMAGES} of {len(metal)} planes light no other surface")
-        metal = metal[:MAX_IMAGES]
-    longer = _longer(metal, MAX_IMAGES - len(metal), notes, "mirrored light")
-    return [row for rows in ([metal[:, None]] if len(metal) else []) + longer for row in rows]
-
-
-def _longer(planes: np.ndarray, most: int, notes: list[str], what: str) -> list[np.ndarray]:
-    """List sequences of 2 and of 3 planes, no plane twice in a row; a length of more than `most` sequences is left out
-    and noted."""
-    found, count = [], len(planes)
+    planes, most = np.flatnonzero(~mirrors.is_solid), MAX_SEQUENCES
     for order in range(2, MAX_ORDER + 1):
-        number = count * (count - 1) ** (order - 1)
+        number = len(planes) * (len(planes) - 1) ** (order - 1)
         if number > most:
-            notes.append(f"{what} by {order} or more mirrors left out: {number} ways among {count} planes")
+            notes.append(f"glints by {order} or more mirrors left out: {number} ways among {len(planes)} planes")
             break
         most -= number
         if number:
-            rows = planes[np.indices((count,) * order).reshape(order, -1).T]
+            rows = planes[np.indices((len(planes),) * order).reshape(order, -1).T]
             found.append(rows[(rows[:, 1:] != rows[:, :-1]).all(axis=1)])
     return found
+
+
+def image_sequences(mirrors: Mirrors, laser: np.ndarray, notes: list[str]) -> list[np.ndarray]:
+    """Return sequences (k,) of metal mirrors that may light the scene, the shorter ones first; k = 1 is nearest what
+    they light. `laser` is its position."""
+    metal = np.flatnonzero(mirrors.is_metal)
+    faces, source = _sides(mirrors, mirrors.corners), _sides(mirrors, laser[None, None])[:, :, 0]
+    # with each row the sides of its first mirror that its light may leave by
+    rows = [(np.array([plane]), source[:, plane] & mirrors.sides[plane]) for plane in metal]
+    rows = [(row, sides) for row, sides in rows if sides.any()]
+    if len(rows) > MAX_IMAGES:
+        notes.append(f"mirrors: {len(rows) - MAX_IMAGES} of {len(rows)} planes light no other surface")
+        rows = rows[:MAX_IMAGES]
+    found = [row for row, _ in rows]
+    for order in range(2, MAX_ORDER + 1):
+        rows = [
+            (np.append(plane, row), faces[:, plane, row[0]] & mirrors.sides[plane])
+            for row, sides in rows
+            for plane in metal
+            if plane != row[0] and (sides & faces[:, row[0], plane]).any()
+        ]
+        rows = [(row, sides) for row, sides in rows if sides.any()]
+        if len(found) + len(rows) > MAX_IMAGES:
+            ways = f"{len(rows)} ways among {len(metal)} planes"
+            notes.append(f"mirrored light by {order} or more mirrors left out: {ways}")
+            break
+        found += [row for row, _ in rows]
+    return found
+
+
+def _sides(mirrors: Mirrors, points: np.ndarray) -> np.ndarray:
+    """Return whether any of some points (m, n, 3) lies before, and behind, planes by more than rounding: (2, planes,
+    m)."""
+    off = np.einsum("pj,mnj->pmn", mirrors.normal, points) - mirrors.offset[:, None, None]
+    least = TOUCHING * np.abs(points).max(axis=2, initial=0)
+    return np.stack(((off > least).any(axis=2), (off < -least).any(axis=2)))
 
 
 def image_of(mirrors: Mirrors, sequence: np.ndarray, point: np.ndarray) -> np.ndarray:

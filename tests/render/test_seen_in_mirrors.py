@@ -1,0 +1,136 @@
+"""What a laser lights directly and the camera sees by way of plane mirrors: traced cell by cell, not by chance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from render import RenderSettings, render
+from render.scene.traced_scene import TracedScene
+from render.specular.image_method import specular_light
+from render.specular.mirrors import MAX_ORDER, find_mirrors, image_sequences
+from scenes import Camera, Laser, Material, Scene, Surface
+from scenes.geometry.shapes import box, sphere
+
+MIRROR = Material("conductor", eta=0.0, k=1.0, specular=0.8)
+WALL = Material(albedo=0.5)
+
+
+def quad(corners: list, material: Material) -> Surface:
+    return Surface(np.array(corners, float), [[0, 1, 2], [0, 2, 3]], material)
+
+
+def view(width: int = 17, height: int = 13, fov_deg: float = 20.0) -> Camera:
+    return Camera.look_at((0, 0, 0), (0, 0, -1), fov_deg=fov_deg, width=width, height=height)
+
+
+def by_pixel(scene: Scene, samples, kept) -> np.ndarray:
+    pixels = scene.camera.width * scene.camera.height
+    return np.bincount(samples.pixel[kept], samples.radiance[kept].astype(float), pixels)
+
+
+def shown_wall(laser: Laser) -> Scene:
+    """A mirror at 45 degrees before the camera shows a wall at x = 3, which the laser lights directly, too."""
+    mirror = quad([(-2, -3, 0), (2, -3, -4), (2, 3, -4), (-2, 3, 0)], MIRROR)
+    wall = quad([(3, -9, 9), (3, -9, -9), (3, 9, -9), (3, 9, 9)], WALL)
+    return Scene("shown wall", (mirror, wall), view(), laser)
+
+
+@pytest.mark.parametrize("baseline_m", [(0, 0, 0), (0.4, -0.2, 0)])
+def test_a_wall_seen_in_a_mirror_and_lit_directly(baseline_m):
+    """R albedo / pi I cos / d^2 at path |unfolded| + d, by 40 x 40 rays a pixel."""
+    scene = shown_wall(Laser("flood", baseline_m, cone_deg=360.0))
+    side, camera = 40, scene.camera
+    column, row = np.meshgrid((np.arange(17 * side) + 0.5) / side, (np.arange(13 * side) + 0.5) / side)
+    rays = camera.rays(column.ravel(), row.ravel())
+    point = rays * (5 / -rays[:, 2:])  # the wall's image is at z = -5
+    unfolded_m = np.linalg.norm(point, axis=1)
+    lit = np.column_stack((-(point[:, 2] + 2), point[:, 1], -point[:, 0] - 2))
+    to_laser = scene.laser.position(camera) - lit
+    leg_m = np.linalg.norm(to_laser, axis=1)
+    light = 0.8 * 0.5 / math.pi * scene.laser.intensity(camera).mean() * -to_laser[:, 0] / leg_m**3
+    pixel = row.ravel().astype(int) * 17 + column.ravel().astype(int)
+    want = np.bincount(pixel, light) / side**2
+    path_m = np.bincount(pixel, light * (unfolded_m + leg_m)) / side**2 / want
+    found = specular_light(TracedScene(scene), 4).samples
+    once = found.bounces == 2
+    got = by_pixel(scene, found, once)
+    assert got == pytest.approx(want, rel=1e-3)
+    moment = found.radiance[once].astype(float) * found.path_m[once]
+    assert np.bincount(found.pixel[once], moment) / got == pytest.approx(path_m, abs=1e-3)
+
+
+def test_paths_leave_out_what_is_traced_by_mirrors():
+    """All light of two surfaces in a mirror is there without noise, and once."""
+    scene = shown_wall(Laser("flood", cone_deg=360.0))
+    whole = render(scene, RenderSettings(bounces=2, grid=4, spp=16, ambient=False))
+    alone = specular_light(TracedScene(scene), 4, bounces=2).samples
+    assert whole.radiance.sum(dtype=float) == pytest.approx(alone.radiance.sum(dtype=float), rel=1e-5)
+    assert not whole.error.any()
+
+
+@pytest.mark.parametrize("bounces", [4, 5, 8])
+def test_a_corridor_of_mirrors_has_each_number_of_mirrors_once(bounces):
+    """Two mirrors face each other: a pixel that meets n of them sees the spot on the far wall with R^n. Up to MAX_ORDER
+    of them are traced, more are met by paths; none is there twice or missing."""
+    half_m, far_m, cone_deg, camera = 0.5, 8.0, 7.0, view(32, 2, 80.0)  # the spot ends beside the mirrors
+    sides = [quad([(x, -9, 1), (x, -9, -far_m), (x, 9, -far_m), (x, 9, 1)], MIRROR) for x in (-half_m, half_m)]
+    wall = quad([(-half_m, -9, -far_m), (half_m, -9, -far_m), (half_m, 9, -far_m), (-half_m, 9, -far_m)], WALL)
+    scene = Scene("corridor", (*sides, wall), camera, Laser("flood", cone_deg=cone_deg))
+    side = 64
+    column, row = np.meshgrid((np.arange(32 * side) + 0.5) / side, (np.arange(2 * side) + 0.5) / side)
+    rays = camera.rays(column.ravel(), row.ravel())
+    point = rays * (far_m / -rays[:, 2:])
+    met = np.floor(np.abs(point[:, 0]) / (2 * half_m) + 0.5).astype(int)
+    folded = point[:, 0] - np.sign(point[:, 0]) * met * 2 * half_m
+    aside_m = np.hypot(folded, point[:, 1])
+    light = 0.8**met * 0.5 / math.pi * scene.laser.intensity(camera).mean() * far_m / np.hypot(aside_m, far_m) ** 3
+    light[(met == 0) | (met + 1 > bounces) | (aside_m > far_m * math.tan(math.radians(cone_deg / 2)))] = 0
+    pixel = row.ravel().astype(int) * 32 + column.ravel().astype(int)
+    want = np.bincount(pixel, light) / side**2
+    found = render(scene, RenderSettings(bounces=bounces, grid=16, spp=1024, ambient=False), seed=1)
+    late = found.bounces > 1
+    got = np.bincount(found.return_pixel[late], found.radiance[late].astype(float), len(want))
+    assert met.max() > MAX_ORDER and np.abs(got - want).max() < 0.06 * want.max()
+    assert got.sum() == pytest.approx(want.sum(), rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_highlight_in_a_mirror_does_not_hang_on_chance(seed):
+    """A chrome ball whose highlight is far smaller than a pixel: each render has it, against 160 x 160 cells; paths
+    found it in one of several."""
+    vertices, faces, _ = sphere(0.05, 5)
+    normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    chrome = Material("roughconductor", roughness=0.02, eta=2.9, k=3.1)
+    mirror = quad([(-2, -3, 0), (2, -3, -4), (2, 3, -4), (-2, 3, 0)], MIRROR)
+    ball = Surface(vertices + (2, 0, -2), faces, chrome, normals=normals)
+    scene = Scene("ball in a mirror", (mirror, ball), view(), Laser("flood", cone_deg=360.0))
+    fine = specular_light(TracedScene(scene), 160, bounces=2).samples
+    want = by_pixel(scene, fine, fine.bounces == 2)
+    found = render(scene, RenderSettings(bounces=2, grid=3, spp=4, ambient=False), seed=seed)
+    got = np.bincount(found.return_pixel, found.radiance.astype(float), len(want))
+    assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want)
+
+
+def test_a_mirror_lights_no_mirror_behind_it():
+    """Of a closed box the laser lights its outer sides alone, and none of these lights another; with a plane before
+    it, each pair that faces each other does."""
+    vertices, faces, uv = box((1.0, 1.0, 0.1))
+    body = Surface(vertices + (0, 0, -3), faces, MIRROR, uv=uv)
+    before = quad([(-0.4, -0.4, 1), (0.4, -0.4, 1), (0.4, 0.4, 1), (-0.4, 0.4, 1)], MIRROR)
+    for surfaces, expected in (((body,), (3,)), ((body, before), (4, 2, 2))):
+        scene = Scene("box", surfaces, view(), Laser(baseline_m=(5, 6, 0)))
+        mirrors, notes = find_mirrors(TracedScene(scene))
+        rows = image_sequences(mirrors, scene.laser.position(scene.camera), notes)
+        assert tuple(np.bincount([len(row) for row in rows])[1:]) == expected, rows
+
+
+def test_light_of_a_laser_inside_a_box_of_mirrors_meets_its_inner_sides():
+    vertices, faces, uv = box((2.0, 2.0, 2.0))
+    for wound in (faces, faces[:, ::-1]):
+        scene = Scene("inside", (Surface(vertices, wound, MIRROR, uv=uv),), view(), Laser())
+        mirrors, notes = find_mirrors(TracedScene(scene))
+        rows = image_sequences(mirrors, np.zeros(3), notes)
+        assert tuple(np.bincount([len(row) for row in rows])[1:]) == (6, 30), rows
