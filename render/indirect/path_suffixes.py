@@ -32,7 +32,7 @@ from render.indirect.primary_vertices import PrimaryVertices, sampling_technique
 from render.indirect.retro_paths import ReachedVertex, connect_retro
 from render.scene.rays import first_opaque, kept, laser_light, sample_bsdf, shape_index, spawn
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
-from render.specular.mirrors import is_mirrored_light, mirrors_in_row, plane_metal
+from render.specular.mirrors import mirrors_in_row, without_mirrored_light
 
 MIN_REVERSAL = 1e-12  # of x2, by which is divided
 
@@ -138,16 +138,15 @@ def trace_suffixes(
     if light_vertices is not None:
         lit = _lit_density(si, density, x1, direction)
         value *= _mis_weight_at_x1(world, primary, scattered, lit, leg + laser_path, alive)
-    # what is reflected by a mirror in the first place cannot be read backwards
-    readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    readable = alive & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)  # a mirror cannot be read backwards
     onward, (onward_weight, *_) = sample_bsdf(si, random, alive)
     at_x1, at_x2 = None, Float(1)
     if has_light_paths(world):
         at_x1 = dr.select(readable, ratio_at_camera(world, x1, direction, readable, sample.pdf), 0)
         at_x2 = dr.maximum(finite_ratio(reversal_of_sample(si, onward, alive)), MIN_REVERSAL)
         value *= camera_share(at_x1 * ratio_at_laser(world, si, -direction, readable))
-    mirrors = mirrors_in_row(world, x1, UInt32(0), alive)
-    value = dr.select(alive & dr.isfinite(value) & ~is_mirrored_light(mirrors), own * value, 0)
+    mirrors = mirrors_in_row(world, x1, None, alive)
+    value = without_mirrored_light(dr.select(alive & dr.isfinite(value), own * value, 0), mirrors)
     goes_on = alive & (task.slots.count > 0)  # x3 is a surface more
     reached = ReachedVertex(x1, sample, own, at_x1, leg, si, readable & goes_on)
     own_retro, back = connect_retro(world, reached, onward, pixel, random)
@@ -233,13 +232,12 @@ def _trace_suffix(
     light_vertices: Array = task.light_vertices  # None where nothing is connected
     lanes, connecting = dr.width(pixel), _connects_suffix(world, light_vertices)
     lane, stride, last = task.slots.lane, task.slots.lanes, task.slots.count
-    slot, path = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes)
+    slot, path, mirrors = dr.zeros(UInt32, lanes), dr.zeros(Float, lanes), state.mirrors + dr.zeros(UInt32, lanes)
     si, sample, weight = mi.SurfaceInteraction3f(state.si), mi.BSDFSample3f(state.sample), Float(state.weight)
     throughput, throughput_at_vertex = Float(state.throughput), Float(state.throughput_at_vertex)
     active = Bool(active) & (slot < last)
     # factors of the vertices between x2 and the current one, of the current one, and what a connection leaves out
     ratio, step, given = dr.full(Float, 1, lanes), dr.full(Float, 1, lanes), state.reversal + dr.zeros(Float, lanes)
-    mirrors = state.mirrors + dr.zeros(UInt32, lanes)
     x2, x3 = (dr.zeros(mi.Vector3f, lanes), *(dr.zeros(Float, lanes),) * 3), (dr.zeros(Float, lanes),) * 2
     while active:
         first = slot == 0
@@ -266,11 +264,8 @@ def _trace_suffix(
             if dr.hint(joined, mode="scalar"):
                 x3, by_chance = _where(first, (lit, by_chance), x3), dr.select(first, 1, by_chance)
             light *= by_chance
-        if dr.hint(plane_metal(world) is not None, mode="scalar"):
-            light = dr.select(is_mirrored_light(mirrors), 0, light)
-            mirrors = mirrors_in_row(world, si, mirrors, active)
-        throughput_at_vertex = throughput * passed
-        ratio, given = finite_ratio(ratio * step), Float(1)
+        light, mirrors = without_mirrored_light(light, mirrors), mirrors_in_row(world, si, mirrors, active)
+        throughput_at_vertex, ratio, given = throughput * passed, finite_ratio(ratio * step), Float(1)
         vertex = light * throughput_at_vertex, path + leg, _ratio_at_end(world, si, -towards.d, ratio, active)
         soonest = _put(task.slots, slot * stride + lane, vertex, soonest, active)
         slot += 1

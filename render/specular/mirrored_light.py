@@ -42,7 +42,8 @@ def mirrored_light(
     for side in sides:
         found, polished = _of_pixels(world, tables, np.flatnonzero(uneven), side, target, planes)
         if side == grid:
-            own = np.bincount(*(np.concatenate([part[k] for part in found]) for k in (0, 3)), uneven.size)
+            pixel, radiance = (np.concatenate([part[k] for part in found]) for k in (0, 3))
+            own = np.bincount(pixel, radiance, uneven.size)
             most = fraction * math.hypot(other, float(np.linalg.norm(own)))
         uneven = _too_uneven(_unevenness(found, uneven.size, side), most)
         uneven[polished] |= side == grid  # what is polished may have a highlight between its cells

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from render.backend.drjit_types import Array, Interactions, Masks, UInts
+from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts
 from render.scene.rays import TOUCHING, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr
 from scenes.errors import listed, require
@@ -170,19 +170,20 @@ def plane_metal(world: TracedScene) -> Array | None:
     return None if isinstance(world.plane_metal, tuple) else world.plane_metal
 
 
-def mirrors_in_row(world: TracedScene, si: Interactions, before: UInts, active: Masks) -> Array:
-    """Return how many plane mirrors a path from the camera has met up to this surface, `before` it and with it; more
-    than MAX_ORDER from the first other surface on."""
+def mirrors_in_row(world: TracedScene, si: Interactions, before: UInts | None, active: Masks) -> Array:
+    """Return how many plane mirrors a path from the camera has met up to this surface, `before` it (None: it is the
+    first one) and with it; more than MAX_ORDER from the first other surface on."""
     metal = plane_metal(world)
     if metal is None:
-        return UInt32(MAX_ORDER + 1)
+        return UInt32(MAX_ORDER + 1) if before is None else before
     met = active & (dr.gather(Float, metal, shape_index(si), active) > 0)
-    return dr.select(met, before + 1, MAX_ORDER + 1)
+    return dr.select(met, (0 if before is None else before) + 1, MAX_ORDER + 1)
 
 
-def is_mirrored_light(mirrors: UInts) -> Array:
-    """Return whether laser light at the next surface is traced by `render.specular`: so many mirrors lead there."""
-    return mirrors <= MAX_ORDER
+def without_mirrored_light(light: Floats, mirrors: UInts) -> Array:
+    """Leave out laser light of a surface that a path met after so many `mirrors_in_row`, which `render.specular`
+    traces."""
+    return dr.select(mirrors <= MAX_ORDER, 0, light)
 
 
 def lit_mirrors(world: TracedScene, mirrors: Mirrors) -> np.ndarray:
