@@ -40,7 +40,6 @@ from render.indirect.path_suffixes import PathSuffixes, Slots, SuffixTask, slots
 from render.indirect.primary_vertices import PrimaryVertices, connect_primary_vertices, reuses_early_paths
 from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, kept, parts_of, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
-from render.specular.mirrors import plane_metal
 
 PLAIN_GOLDEN = 2654435769  # bits of the golden ratio, in units of 2^-32
 
@@ -83,7 +82,7 @@ class PathTask(NamedTuple):
 def trace_paths(task: PathTask) -> PathBatch:
     """Trace the camera paths of one launch, and connect their vertices to light vertices."""
     world, pixels, launch, bounces, seed, batches, reuses_paths, from_m = task
-    glossy_of(world), plane_metal(world)  # looked for before anything is recorded
+    glossy_of(world)  # looked for before anything is recorded
     members = traced_members(pixels, shared=reuses_paths or from_m is not None)
     lanes = len(launch.block) * members
     seeds = np.random.SeedSequence(seed).generate_state(4)

@@ -87,6 +87,9 @@ class TracedScene:
         # what these reflect depends on where they are seen from
         rough_lobes = [float(m.kind in ("roughplastic", "roughconductor")) for m in materials]
         self.has_rough_lobes, self.rough_lobes = any(rough_lobes), self.table(rough_lobes)
+        # what these show is traced apart (`render.specular`)
+        mirrors = [float(m.kind == "conductor") for m in materials]
+        self.has_mirrors, self.mirrors = any(mirrors), self.table(mirrors)
         self.has_mixed_lobes = any(m.kind not in ("diffuse", "roughdiffuse") for m in materials)
         # paths that meet smooth plastic share none of it (`render.indirect.reuse`)
         self.allows_reuse = self.table([m.kind != "plastic" for m in materials])
@@ -101,7 +104,6 @@ class TracedScene:
         self.solid_indices = sorted({m.ior for m in materials if m.kind == "dielectric"})
         self.solid_index = dr.opaque(Float, max(self.solid_indices, default=1.0))
         self.refracts = False  # `render.scene.refraction`
-        self.plane_metal: Any = None  # `render.specular.mirrors.plane_metal`
         self.recordings = Recordings()
         self._bind_camera(scene)
 

@@ -24,7 +24,6 @@ from render.specular.mirrors import (
     glint_sequences,
     image_sequences,
     lit_mirrors,
-    plane_metal,
 )
 from render.specular.unfolded_ways import MirrorTables
 from render.transient.samples import Samples, concatenate, merge, no_samples
@@ -72,7 +71,7 @@ def specular_light(
             parts.append(glints(world, tables, mirrors, sequences[lit[sequences[:, -1]]]))
     laser = world.scene.laser.position(world.scene.camera) - world.scene.camera.origin
     of_mirrors = [row for row in image_sequences(mirrors, laser, notes) if lit[row[-1]]]
-    if plane_metal(world) is not None:
+    if world.has_mirrors:
         of_mirrors.insert(0, np.zeros(0, np.int64))
     for sequence in of_mirrors:
         if max(len(sequence), 1) < bounces:  # a mirror, and the surface that is lit

@@ -103,7 +103,7 @@ def _cells(
     ray, local = camera_rays(world, x, y)
     si, weight, optical, distance, axes, met = _seen(world, tables, ray, lanes)
     active = si.is_valid() & (weight > 0)
-    active &= dr.gather(Float, tables.mirrors, shape_index(si), active) == 0
+    active &= dr.gather(Float, world.mirrors, shape_index(si), active) == 0
     if not planes:
         active &= met > 0  # else it is direct light
 
@@ -125,9 +125,10 @@ def _cells(
 
 @dr.syntax
 def _seen(world: TracedScene, tables: MirrorTables, ray: Rays, lanes: int) -> tuple[Array, ...]:
-    """Find the first surface that is no plane mirror: interaction, weight of the way, optical and geometric length [m].
+    """Find the first surface that is no mirror: interaction, weight of the way, optical and geometric length [m].
 
-    Also the camera's axes as the mirrors show them (the unfolded camera's frame) and the number of mirrors met.
+    Also the camera's axes as the mirrors show them (the unfolded camera's frame; curved mirrors as their tangent
+    planes) and the number of mirrors met.
     """
     si, weight, optical, distance = first_opaque(world, ray, Bool(True))
     weight = weight + dr.zeros(Float, lanes)
@@ -135,9 +136,9 @@ def _seen(world: TracedScene, tables: MirrorTables, ray: Rays, lanes: int) -> tu
     direction = mi.Vector3f(ray.d)
     met = dr.zeros(UInt32, lanes)
     mirror = si.is_valid()
-    mirror &= dr.gather(Float, tables.mirrors, shape_index(si), mirror) > 0
+    mirror &= dr.gather(Float, world.mirrors, shape_index(si), mirror) > 0
     while mirror & (met < MAX_ORDER):
-        normal = mi.Vector3f(si.n)
+        normal = mi.Vector3f(si.sh_frame.n)
         weight *= reflectance(tables, shape_index(si), dr.dot(normal, direction), mirror)
         direction = direction - 2 * dr.dot(normal, direction) * normal
         right = right - 2 * dr.dot(normal, right) * normal
@@ -150,7 +151,7 @@ def _seen(world: TracedScene, tables: MirrorTables, ray: Rays, lanes: int) -> tu
         distance += step
         met += 1
         mirror = mirror & si.is_valid()
-        mirror &= dr.gather(Float, tables.mirrors, shape_index(si), mirror) > 0
+        mirror &= dr.gather(Float, world.mirrors, shape_index(si), mirror) > 0
     return si, weight, optical, distance, (right, down, forward), met
 
 

@@ -76,7 +76,7 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
         rows += [(*plane, shape, kind == "conductor", kind == "dielectric") for plane in planes]
     if curved:
         notes.append(
-            f"specular light: curved smooth surfaces ({listed(curved)}): glints and what they mirror are left out"
+            f"specular light: curved smooth surfaces ({listed(curved)}): glints and what they light are left out"
         )
     kinds = {surface.material.kind for surface in world.scene.surfaces}
     if kinds & {"dielectric", "thindielectric"}:
@@ -155,28 +155,12 @@ def _rectangle(normal: np.ndarray, offset: float, points: np.ndarray) -> np.ndar
     return offset * normal + np.array([(a, b) for a in (low[0], high[0]) for b in (low[1], high[1])]) @ across.T
 
 
-def plane_metal(world: TracedScene) -> Array | None:
-    """Return which registered shapes are metal in planes alone, 1 or 0 each, looked for once; None without any.
-
-    A mesh that has a curved surface, too, shows no flat image.
-    """
-    if world.plane_metal is None:
-        flat = [
-            group[0].material.kind == "conductor"
-            and all(s.normals is None or planes_of(s, s.vertices[0]) is not None for s in group)
-            for group in world.groups
-        ]
-        world.plane_metal = world.table([float(metal) for metal in flat]) if any(flat) else ()
-    return None if isinstance(world.plane_metal, tuple) else world.plane_metal
-
-
 def mirrors_in_row(world: TracedScene, si: Interactions, before: UInts | None, active: Masks) -> Array:
-    """Return how many plane mirrors a path from the camera has met up to this surface, `before` it (None: it is the
-    first one) and with it; more than MAX_ORDER from the first other surface on."""
-    metal = plane_metal(world)
-    if metal is None:
+    """Return how many mirrors of smooth metal a path from the camera has met up to this surface, `before` it (None: it
+    is the first one) and with it; more than MAX_ORDER from the first other surface on."""
+    if not world.has_mirrors:
         return UInt32(MAX_ORDER + 1) if before is None else before
-    met = active & (dr.gather(Float, metal, shape_index(si), active) > 0)
+    met = active & (dr.gather(Float, world.mirrors, shape_index(si), active) > 0)
     return dr.select(met, (0 if before is None else before) + 1, MAX_ORDER + 1)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from render.backend.drjit_types import Array, Floats, Masks
 from render.scene.rays import passage, shape_index
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, upload
-from render.specular.mirrors import COATED, Mirrors, plane_metal
+from render.specular.mirrors import COATED, Mirrors
 
 
 class MirrorTables:
@@ -25,8 +25,6 @@ class MirrorTables:
         self.ior = world.table([m.ior for m in materials])
         self.eta, self.k = world.table([m.eta for m in materials]), world.table([m.k for m in materials])
         self.kind = world.table([COATED.index(m.kind) if m.kind in COATED else -1 for m in materials])
-        metal = plane_metal(world)
-        self.mirrors = world.table([0.0] * len(materials)) if metal is None else metal
 
 
 def reflectance(tables: MirrorTables, shape: Array, cosine: Floats, active: Masks) -> Array:

@@ -1,4 +1,4 @@
-"""What a laser lights directly and the camera sees by way of plane mirrors: traced cell by cell, not by chance."""
+"""What a laser lights directly and the camera sees by way of mirrors: traced cell by cell, not by chance."""
 
 from __future__ import annotations
 
@@ -69,6 +69,40 @@ def test_paths_leave_out_what_is_traced_by_mirrors():
     alone = specular_light(TracedScene(scene), 4, bounces=2).samples
     assert whole.radiance.sum(dtype=float) == pytest.approx(alone.radiance.sum(dtype=float), rel=1e-5)
     assert not whole.error.any()
+
+
+def test_a_wall_seen_in_a_ball():
+    """A ball of smooth metal shows a wall beside the camera: R albedo / pi I cos / d^2, by 24 x 24 rays a pixel."""
+    radius, centre, wall_x, camera = 0.5, np.array((0.0, 0.0, -3.0)), -2.0, view(24, 24, 18.0)
+    points, faces, _ = sphere(radius, 6)
+    ball = Surface(points + centre, faces, MIRROR, normals=points / radius)
+    wall = quad([(wall_x, -40, 40), (wall_x, 40, 40), (wall_x, 40, -40), (wall_x, -40, -40)], WALL)
+    scene = Scene("ball", (ball, wall), camera, Laser("flood", (0.3, 0.4, 0), cone_deg=360.0))
+    side = 24
+    column, row = np.meshgrid(*[(np.arange(24 * side) + 0.5) / side] * 2)
+    rays = camera.rays(column.ravel(), row.ravel())
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    along = rays @ centre
+    off = along**2 - centre @ centre + radius**2
+    hits = off > 0
+    met = rays * (along - np.sqrt(np.maximum(off, 0)))[:, None]
+    normal = (met - centre) / radius
+    onward = rays - 2 * (rays * normal).sum(axis=1, keepdims=True) * normal
+    way = (wall_x - met[:, 0]) / np.minimum(onward[:, 0], -1e-9)
+    lit = met + way[:, None] * onward
+    to_laser = scene.laser.position(camera) - lit
+    leg = np.linalg.norm(to_laser, axis=1)
+    light = 0.8 * 0.5 / math.pi * scene.laser.intensity(camera).mean() * to_laser[:, 0] / leg**3
+    from_laser = -to_laser / leg[:, None]  # the ball's shadow on the wall
+    nearest = ((centre - scene.laser.position(camera)) * from_laser).sum(axis=1)
+    shadow = np.linalg.norm(scene.laser.position(camera) + nearest[:, None] * from_laser - centre, axis=1) < radius
+    light[~hits | (onward[:, 0] >= -1e-9) | (np.abs(lit[:, 1:]) > 40).any(axis=1) | (shadow & (nearest < leg))] = 0
+    pixel = row.ravel().astype(int) * 24 + column.ravel().astype(int)
+    want = np.bincount(pixel, light) / side**2
+    found = specular_light(TracedScene(scene), 8, allowed=(1e-3, 0.0)).samples
+    got = by_pixel(scene, found, found.bounces == 2)
+    assert got.sum() == pytest.approx(want.sum(), rel=2e-3)
+    assert np.linalg.norm(got - want) < 0.01 * np.linalg.norm(want)
 
 
 @pytest.mark.parametrize("bounces", [4, 5, 8])
