@@ -14,7 +14,8 @@ from render.specular.unfolded_ways import MirrorTables, connect_to_image, reflec
 from render.transient.samples import Samples, merge, select
 
 CELLS_PER_LAUNCH = 1 << 20
-FINER, FINER_M = (32, 128), 2e-3  # cells a side of polished pixels, of those uneven still; merged within so much
+FINER, FINER_M = (32, 128), 2e-3  # cells a side of pixels with narrow highlights, of those uneven still; merged within
+RESOLVED = 0.5  # of a lobe's width between neighbouring cells: those that are no farther apart miss no highlight
 WIDEST_SPREAD = 0.25  # of the path: a footprint that spans more describes no mesh
 
 
@@ -40,13 +41,13 @@ def mirrored_light(
     uneven, parts = np.full(camera.height * camera.width, True), list[Samples]()
     sides = (grid, *(side for side in FINER if side > grid and fraction > 0))
     for side in sides:
-        found, polished = _of_pixels(world, tables, np.flatnonzero(uneven), side, target, planes)
+        found, narrow = _of_pixels(world, tables, np.flatnonzero(uneven), side, target, planes)
         if side == grid:
             pixel, radiance = (np.concatenate([part[k] for part in found]) for k in (0, 3))
             own = np.bincount(pixel, radiance, uneven.size)
             most = fraction * math.hypot(other, float(np.linalg.norm(own)))
         uneven = _too_uneven(_unevenness(found, uneven.size, side), most)
-        uneven[polished] |= side == grid  # what is polished may have a highlight between its cells
+        uneven[narrow] |= side == grid
         uneven &= side < sides[-1]
         parts += (merge(select(part, ~uneven[part.pixel]), 0 if side == grid else FINER_M) for part in found)
         if not uneven.any():
@@ -57,20 +58,33 @@ def mirrored_light(
 def _of_pixels(
     world: TracedScene, tables: MirrorTables, pixels: np.ndarray, grid: int, target: UInts, planes: list[Array]
 ) -> tuple[list[Samples], np.ndarray]:
-    """Return mirrored light of some pixels, a sample a lit cell, launch by launch; and which show polished surfaces."""
-    cells, parts, shown = grid * grid, [], []
+    """Return mirrored light of some pixels, a sample a lit cell, launch by launch; and which pixels may have a
+    highlight between their cells."""
+    cells, parts, narrow = grid * grid, [], []
     per_chunk = max(1, CELLS_PER_LAUNCH // cells)
     for first in range(0, len(pixels), per_chunk):
         chunk = pixels[first : first + per_chunk]
-        path, half_width, radiance, met, polished = _cells(world, tables, chunk, grid, target, planes)
-        dr.eval(path, half_width, radiance, met, polished)
-        shown.append(chunk[np.array(polished).reshape(-1, cells).any(axis=1)])
+        path, half_width, radiance, met, polished, off_peak = _cells(world, tables, chunk, grid, target, planes)
+        dr.eval(path, half_width, radiance, met, polished, off_peak)
+        narrow.append(chunk[_may_miss_highlights(np.array(polished), np.array(off_peak), grid)])
         radiance, bounces = np.array(radiance, dtype=np.float64), np.array(met) + 1 + len(planes)
         lit = (radiance > 0) & (bounces <= tables.bounces)
         path, half_width = (np.array(value, dtype=np.float64)[lit] for value in (path, half_width))
         met_in_all = bounces[lit].astype(np.uint8)
         parts.append(Samples(np.repeat(chunk, cells)[lit], path, half_width, radiance[lit], met_in_all))
-    return parts, np.concatenate(shown)
+    return parts, np.concatenate(narrow)
+
+
+def _may_miss_highlights(polished: np.ndarray, off_peak: np.ndarray, grid: int) -> np.ndarray:
+    """Return which pixels have polished cells, and cells beside these that are not or lie farther from them than
+    RESOLVED, (pixels,): a highlight may then fall between."""
+    polished = polished.reshape(-1, grid * grid)
+    wide = np.zeros(len(polished), bool)
+    if grid > 1:
+        places = off_peak.T.reshape(-1, grid, grid, 3)
+        steps = (np.square(np.diff(places, axis=axis)).sum(axis=-1).max(axis=(1, 2)) for axis in (1, 2))
+        wide = polished.all(axis=1) & (np.maximum(*steps) <= RESOLVED**2)
+    return polished.any(axis=1) & ~wide
 
 
 def _unevenness(parts: list[Samples], pixels: int, grid: int) -> np.ndarray:
@@ -90,8 +104,11 @@ def _too_uneven(unevenness: np.ndarray, allowed: float) -> np.ndarray:
 
 def _cells(
     world: TracedScene, tables: MirrorTables, pixels: np.ndarray, grid: int, target: UInts, planes: list[Array]
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Trace cells of pixels; return path, half width [m], radiance / cells, mirrors met, and if polished and lit."""
+) -> tuple[Array, ...]:
+    """Trace cells of pixels; return path, half width [m], radiance / cells, mirrors met, and if polished and lit.
+
+    And how far each is from the middle of a highlight: the half vector beside the normal, in units of the roughness.
+    """
     side, lanes = dr.opaque(UInt32, grid), len(pixels) * grid * grid
     lane = dr.arange(UInt32, lanes)
     cells = side * side
@@ -120,7 +137,10 @@ def _cells(
     half_width = _half_width(local, axes, si.n, -direction, distance, pitch / world.focal_px)
     half_width = dr.minimum(half_width, WIDEST_SPREAD * path)
     polished = active & (passed > 0) & (dr.gather(Float, world.glossy_materials, shape_index(si), active) > 0)
-    return path, half_width, dr.select(active & dr.isfinite(radiance), radiance, 0), met, polished
+    half = dr.normalize(si.to_local(direction) + si.wi)
+    off_peak = si.to_world(half * dr.sign(half.z)) - si.sh_frame.n
+    off_peak /= dr.maximum(dr.gather(Float, world.roughness, shape_index(si), polished), 1e-6)
+    return path, half_width, dr.select(active & dr.isfinite(radiance), radiance, 0), met, polished, off_peak
 
 
 @dr.syntax

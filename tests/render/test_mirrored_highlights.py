@@ -93,3 +93,16 @@ def test_light_of_more_bounces_is_left_out_before_returns_merge():
     assert merged.bounces.max() == 2 and merged.radiance.sum(dtype=float) == pytest.approx(few, rel=1e-5)
     late = specular_light(world, 4, 5e-3).samples
     assert late.radiance[late.bounces <= 2].sum(dtype=float) > 1.002 * few
+
+
+def test_highlights_that_cells_resolve_are_traced_no_finer():
+    """A polished panel that a mirror lights: 5 cells a side but at borders, and its light is that of 160."""
+    scene = bathroom(METAL)
+    panel = np.array([(-3, -3, -4), (3, -3, -4), (3, 3, -4), (-3, 3, -4)], float)
+    coat = Material("roughplastic", albedo=0.4, roughness=0.1, ior=1.5)
+    scene = replace(scene, surfaces=(scene.surfaces[0], Surface(panel, [[0, 1, 2], [0, 2, 3]], coat)))
+    found = specular_light(TracedScene(scene), 5, 0.0, (1e-2, 0.0)).samples
+    cells = np.bincount(found.pixel[found.bounces == 2])
+    assert (cells == 25).sum() > 0.6 * (cells > 0).sum()
+    fine, coarse = mirrored(scene, 160, 0.0), mirrored(scene, 5, 1e-2)
+    assert np.linalg.norm(coarse - fine) < 0.01 * np.linalg.norm(fine)
