@@ -22,6 +22,7 @@ MAX_ORDER = 3  # mirrors in a row
 MAX_PLANES = 64  # a smooth mesh of more planes is a curved surface
 MAX_SEQUENCES = 1 << 18
 MAX_IMAGES = 64
+MAX_FACING = 512  # planes of which it is asked which face each other
 MAX_SLAB_ERROR_M = 0.010
 # A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
 LOBE_RAYS, LOBE_RAD = 32, 5e-4
@@ -71,9 +72,8 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
             found = planes_of(surface, world.scene.camera.origin, laser)
             if found is None:
                 curved.setdefault(surface.name, None)
-            for plane in found or ():
-                _add_plane(planes, plane)
-        rows += [(*plane, shape, kind == "conductor", kind == "dielectric") for plane in planes]
+            planes += found or ()
+        rows += [(*plane, shape, kind == "conductor", kind == "dielectric") for plane in _merged(planes)]
     if curved:
         notes.append(
             f"specular light: curved smooth surfaces ({listed(curved)}): glints and what they light are left out"
@@ -135,17 +135,27 @@ def _cluster(corners: np.ndarray, normal: np.ndarray, side: np.ndarray) -> list[
     return planes
 
 
-def _add_plane(planes: list[tuple], plane: tuple) -> None:
-    """Append a plane, or widen an equal one: two surfaces of one material in one plane give one glint."""
-    normal, offset, low, high, corners, sides = plane
-    for i, (n, c, a, b, before, sides_before) in enumerate(planes):
-        sign = np.sign(n @ normal)
-        if abs(n @ normal) > 1 - 1e-9 and abs(sign * offset - c) < 2e-6 * max(np.abs(b).max(), np.abs(a).max()):
+def _merged(planes: list[tuple]) -> list[tuple]:
+    """Return planes of which equal ones are one: two surfaces of one material in one plane give one glint."""
+    kept: list[tuple] = []
+    normals, offsets, sizes = np.empty((len(planes), 3)), np.empty(len(planes)), np.empty(len(planes))
+    for plane in planes:
+        count = len(kept)
+        normal, offset, low, high, corners, sides = plane
+        cosine = normals[:count] @ normal
+        off = np.abs(np.sign(cosine) * offset - offsets[:count])
+        equal = np.flatnonzero((np.abs(cosine) > 1 - 1e-9) & (off < 2e-6 * sizes[:count]))
+        place = equal[0] if len(equal) else count
+        if len(equal):
+            n, c, a, b, before, sides_before = kept[place]
             both = _rectangle(n, c, np.concatenate((before, corners)))
-            sides = sides_before | (sides if sign > 0 else sides[::-1])
-            planes[i] = (n, c, np.minimum(a, low), np.maximum(b, high), both, sides)
-            return
-    planes.append(plane)
+            sides = sides_before | (sides if cosine[place] > 0 else sides[::-1])
+            kept[place] = (n, c, np.minimum(a, low), np.maximum(b, high), both, sides)
+        else:
+            kept.append(plane)
+            normals[place], offsets[place] = normal, offset
+        sizes[place] = max(np.abs(kept[place][2]).max(), np.abs(kept[place][3]).max())
+    return kept
 
 
 def _rectangle(normal: np.ndarray, offset: float, points: np.ndarray) -> np.ndarray:
@@ -197,34 +207,37 @@ def image_sequences(mirrors: Mirrors, laser: np.ndarray, notes: list[str]) -> li
     """Return sequences (k,) of metal mirrors that may light the scene, the shorter ones first; k = 1 is nearest what
     they light. `laser` is its position."""
     metal = np.flatnonzero(mirrors.is_metal)
-    faces, source = _sides(mirrors, mirrors.corners), _sides(mirrors, laser[None, None])[:, :, 0]
-    # with each row the sides of its first mirror that its light may leave by
-    rows = [(np.array([plane]), source[:, plane] & mirrors.sides[plane]) for plane in metal]
-    rows = [(row, sides) for row, sides in rows if sides.any()]
-    if len(rows) > MAX_IMAGES:
-        notes.append(f"mirrors: {len(rows) - MAX_IMAGES} of {len(rows)} planes light no other surface")
-        rows = rows[:MAX_IMAGES]
+    source = _sides(mirrors, metal, laser[None, None])[:, :, 0] & mirrors.sides[metal].T
+    lit = np.flatnonzero(source.any(axis=0))
+    if len(lit) > MAX_IMAGES:
+        notes.append(f"mirrors: the smallest {len(lit) - MAX_IMAGES} of {len(lit)} planes light no other surface")
+        edges = mirrors.corners[metal[lit], 1:3] - mirrors.corners[metal[lit], :1]
+        lit = np.sort(lit[np.argsort(-np.linalg.norm(edges, axis=2).prod(axis=1), kind="stable")[:MAX_IMAGES]])
+    # with each row, of places in `metal`, the sides of its first mirror that its light may leave by
+    rows: list[tuple[tuple[int, ...], np.ndarray]] = [((int(first),), source[:, first]) for first in lit]
     found = [row for row, _ in rows]
+    faces = _sides(mirrors, metal, mirrors.corners[metal[:MAX_FACING]])
     for order in range(2, MAX_ORDER + 1):
         rows = [
-            (np.append(plane, row), faces[:, plane, row[0]] & mirrors.sides[plane])
+            ((place, *row), faces[:, place, row[0]] & mirrors.sides[metal[place]])
             for row, sides in rows
-            for plane in metal
-            if plane != row[0] and (sides & faces[:, row[0], plane]).any()
+            for place in np.flatnonzero((sides[:, None] & faces[:, row[0]]).any(axis=0)).tolist()
+            if place != row[0]
         ]
         rows = [(row, sides) for row, sides in rows if sides.any()]
-        if len(found) + len(rows) > MAX_IMAGES:
+        if len(found) + len(rows) > MAX_IMAGES or len(metal) > MAX_FACING:
             ways = f"{len(rows)} ways among {len(metal)} planes"
             notes.append(f"mirrored light by {order} or more mirrors left out: {ways}")
             break
         found += [row for row, _ in rows]
-    return found
+    return [metal[list(row)] for row in found]
 
 
-def _sides(mirrors: Mirrors, points: np.ndarray) -> np.ndarray:
+def _sides(mirrors: Mirrors, planes: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return whether any of some points (m, n, 3) lies before, and behind, planes by more than rounding: (2, planes,
     m)."""
-    off = np.einsum("pj,mnj->pmn", mirrors.normal, points) - mirrors.offset[:, None, None]
+    off = (mirrors.normal[planes] @ points.reshape(-1, 3).T).reshape(len(planes), *points.shape[:2])
+    off -= mirrors.offset[planes][:, None, None]
     least = TOUCHING * np.abs(points).max(axis=2, initial=0)
     return np.stack(((off > least).any(axis=2), (off < -least).any(axis=2)))
 

@@ -6,6 +6,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+ROUNDING = 1e-6  # of a volume and an angle
+
 
 def visible_sides(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Return the side of every face that light from `point` may reach, (F,): 1 that of its normal, -1 the other, 0
@@ -13,7 +15,7 @@ def visible_sides(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) ->
 
     A body is what faces with common corners make up. It is closed where each of its edges has as many faces that run
     along it one way as the other way. Light from outside a closed body reaches its outer sides alone, light from inside
-    its inner sides alone.
+    its inner sides alone. Of an open body, of one without volume and of one on which `point` lies it may reach both.
 
     Parameters
     ----------
@@ -34,8 +36,12 @@ def visible_sides(vertices: np.ndarray, faces: np.ndarray, point: np.ndarray) ->
     six_volumes = (a * np.cross(b, c)).sum(axis=1)
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     below = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-    # the solid angle of a triangle (van Oosterom, Strackee 1983); those of a body make 4 pi around a point inside
-    turns = np.bincount(body, np.arctan2(six_volumes, below), bodies) / (2 * np.pi)
-    outwards = np.sign(np.bincount(body, six_volumes, bodies))
+    # half the solid angle of a triangle (van Oosterom, Strackee 1983): those of a body make 2 pi around a point inside
+    half_angle = np.arctan2(six_volumes, below)
+    turns = np.bincount(body, half_angle, bodies) / (2 * np.pi)
+    touched = np.bincount(body, np.abs(half_angle) > np.pi - ROUNDING, bodies) > 0
+    touched |= np.abs(turns - np.round(turns)) > ROUNDING
+    volume, most = np.bincount(body, six_volumes, bodies), np.bincount(body, np.abs(six_volumes), bodies)
+    outwards = np.sign(volume) * (np.abs(volume) > ROUNDING * most)
     side = np.where(np.abs(turns) > 0.5, -outwards, outwards)
-    return np.where(is_open, 0, side).astype(int)[body]
+    return np.where(is_open | touched, 0, side).astype(int)[body]

@@ -168,3 +168,20 @@ def test_light_of_a_laser_inside_a_box_of_mirrors_meets_its_inner_sides():
         mirrors, notes = find_mirrors(TracedScene(scene))
         rows = image_sequences(mirrors, np.zeros(3), notes)
         assert tuple(np.bincount([len(row) for row in rows])[1:]) == (6, 30), rows
+
+
+def test_of_very_many_mirrors_the_largest_light_others():
+    centres = [(x, y, -5.0) for x in np.linspace(-2, 2, 12) for y in np.linspace(-2, 2, 12)]
+    sizes = np.full(len(centres), 0.02)
+    sizes[100] = 0.2
+    square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+    tilted = square @ np.array([(1, 0, 0.3), (0, 1, 0.2), (0, 0, 1)])
+    surfaces = tuple(
+        quad(list(tilted * size + centre + (0, 0, 0.01 * k)), MIRROR)
+        for k, (size, centre) in enumerate(zip(sizes, centres, strict=True))
+    )
+    mirrors, notes = find_mirrors(TracedScene(Scene("many", surfaces, view(), Laser())))
+    rows = image_sequences(mirrors, np.zeros(3), notes)
+    largest = np.argmax(mirrors.high[:, 0] - mirrors.low[:, 0])
+    assert len(rows) == 64 and largest in np.concatenate(rows)
+    assert any("the smallest 80 of 144 planes" in note for note in notes)
