@@ -16,13 +16,13 @@ import numpy as np
 from render.scene.traced_scene import TracedScene
 from render.settings import MAX_BOUNCES
 from render.specular.glints import glints
+from render.specular.image_sequences import image_sequences
 from render.specular.mirrored_light import mirrored_light
 from render.specular.mirrors import (
     COATED,
     check_slabs,
     find_mirrors,
     glint_sequences,
-    image_sequences,
     lit_mirrors,
 )
 from render.specular.unfolded_ways import MirrorTables
@@ -69,8 +69,7 @@ def specular_light(
     for sequences in glint_sequences(mirrors, notes):
         if sequences.shape[1] <= bounces:
             parts.append(glints(world, tables, mirrors, sequences[lit[sequences[:, -1]]]))
-    laser = world.scene.laser.position(world.scene.camera) - world.scene.camera.origin
-    of_mirrors = [row for row in image_sequences(mirrors, laser, notes) if lit[row[-1]]]
+    of_mirrors = [row for row in image_sequences(world, mirrors, notes) if lit[row[-1]]]
     if world.has_mirrors:
         of_mirrors.insert(0, np.zeros(0, np.int64))
     for sequence in of_mirrors:

@@ -14,15 +14,12 @@ from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts
 from render.scene.rays import TOUCHING, shape_index
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr
 from scenes.errors import listed, require
-from scenes.geometry.bodies import visible_sides
 from scenes.geometry.shapes import axis_frame
 from scenes.model import Surface
 
 MAX_ORDER = 3  # mirrors in a row
 MAX_PLANES = 64  # a smooth mesh of more planes is a curved surface
 MAX_SEQUENCES = 1 << 18
-MAX_IMAGES = 64
-MAX_FACING = 512  # planes of which it is asked which face each other
 MAX_SLAB_ERROR_M = 0.010
 # A glint is a thin cone of rays: on an edge or in the apex of a corner cube, the share of them that comes back counts.
 LOBE_RAYS, LOBE_RAD = 32, 5e-4
@@ -32,9 +29,8 @@ COATED = ("conductor", "plastic", "dielectric", "thindielectric")
 class Mirrors(NamedTuple):
     """Plane smooth faces n . x = c, the camera at the origin, (n,) or (n, 3) each.
 
-    `low` and `high` bound the face, and so do the `corners` (n, 4, 3) of a rectangle in its plane. `sides` (n, 2) are
-    those before and behind it that the laser's light may reach; `shape` is its mesh's registered index; `is_metal` and
-    `is_solid` its material.
+    `low` and `high` bound the face, and so do the `corners` (n, 4, 3) of a rectangle in its plane; `shape` is its
+    mesh's registered index; `is_metal` and `is_solid` its material.
     """
 
     normal: np.ndarray
@@ -42,7 +38,6 @@ class Mirrors(NamedTuple):
     low: np.ndarray
     high: np.ndarray
     corners: np.ndarray
-    sides: np.ndarray
     shape: np.ndarray
     is_metal: np.ndarray
     is_solid: np.ndarray
@@ -61,7 +56,6 @@ class SlabError(NamedTuple):
 def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
     """Return all plane smooth faces of a scene, and notes that name the smooth surfaces that are curved."""
     rows, notes = [], []
-    laser = world.scene.laser.position(world.scene.camera)
     curved: dict[str, None] = {}
     for shape, group in zip(world.shape_ids, world.groups, strict=True):
         kind = group[0].material.kind
@@ -69,7 +63,7 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
             continue
         planes: list[tuple] = []
         for surface in group:
-            found = planes_of(surface, world.scene.camera.origin, laser)
+            found = planes_of(surface, world.scene.camera.origin)
             if found is None:
                 curved.setdefault(surface.name, None)
             planes += found or ()
@@ -83,19 +77,18 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
         notes.append("glass: its own return is rendered; other light that it reflects is left out")
     if "plastic" in kinds:
         notes.append("smooth plastic: the laser's glint in its coat is rendered, not what is lit by way of the coat")
-    if any(row[7] for row in rows):
+    if any(row[6] for row in rows):
         notes.append("mirrors: light by way of them that meets two or more other surfaces first is left out")
-    of_none = [np.empty((0, *shape)) for shape in ((3,), (), (3,), (3,), (4, 3), (2,), (), (), ())]
+    of_none = [np.empty((0, *shape)) for shape in ((3,), (), (3,), (3,), (4, 3), (), (), ())]
     columns: list = list(zip(*rows, strict=True)) if rows else of_none
-    types = (float, float, float, float, float, bool, np.int64, bool, bool)
+    types = (float, float, float, float, float, np.int64, bool, bool)
     return Mirrors(*(np.array(c, dtype=t) for c, t in zip(columns, types, strict=True))), notes
 
 
-def planes_of(surface: Surface, origin: np.ndarray, laser: np.ndarray | None = None) -> list[tuple] | None:
-    """Return planes (normal, offset, low, high, corners, sides) of a mesh relative to `origin`; None for a curved one.
+def planes_of(surface: Surface, origin: np.ndarray) -> list[tuple] | None:
+    """Return planes (normal, offset, low, high, corners) of a mesh relative to `origin`; None for a curved one.
 
-    Triangles without area do not count. `sides` are those before and behind a plane that light of a `laser` may reach,
-    by which bodies are closed; both without it.
+    Triangles without area do not count.
     """
     corners = (surface.vertices - origin)[surface.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -107,17 +100,15 @@ def planes_of(surface: Surface, origin: np.ndarray, laser: np.ndarray | None = N
         flat = np.abs(np.einsum("fcj,fj->fc", shading, normal)) > (1 - 1e-5) * area[:, None]
         if not flat[kept].all():
             return None
-    order = np.flatnonzero(kept)[np.argsort(-area[kept], kind="stable")]
-    corners, normal = corners[order], normal[order] / area[order, None]
+    order = np.argsort(-area[kept], kind="stable")
+    corners, normal = corners[kept][order], (normal[kept] / area[kept, None])[order]
     # a curved mesh shows in its largest faces already: no need to look for planes among a million
-    if len(corners) > 256 and _cluster(corners[:256], normal[:256], np.zeros(256)) is None:
+    if len(corners) > 256 and _cluster(corners[:256], normal[:256]) is None:
         return None
-    if laser is None or surface.material.has_holes:
-        return _cluster(corners, normal, np.zeros(len(corners)))
-    return _cluster(corners, normal, visible_sides(surface.vertices, surface.faces, laser)[order])
+    return _cluster(corners, normal)
 
 
-def _cluster(corners: np.ndarray, normal: np.ndarray, side: np.ndarray) -> list[tuple] | None:
+def _cluster(corners: np.ndarray, normal: np.ndarray) -> list[tuple] | None:
     planes: list[tuple] = []
     while len(corners):
         if len(planes) == MAX_PLANES:
@@ -128,10 +119,8 @@ def _cluster(corners: np.ndarray, normal: np.ndarray, side: np.ndarray) -> list[
         same = close & (np.abs(normal @ n) > 1 - 1e-6)
         same[0] = True
         points = corners[same].reshape(-1, 3)
-        seen = side[same] * np.sign(normal[same] @ n)
-        sides = np.array((np.any(seen >= 0), np.any(seen <= 0)))
-        planes.append((n, c, points.min(axis=0), points.max(axis=0), _rectangle(n, c, points), sides))
-        corners, normal, side = corners[~same], normal[~same], side[~same]
+        planes.append((n, c, points.min(axis=0), points.max(axis=0), _rectangle(n, c, points)))
+        corners, normal = corners[~same], normal[~same]
     return planes
 
 
@@ -141,16 +130,15 @@ def _merged(planes: list[tuple]) -> list[tuple]:
     normals, offsets, sizes = np.empty((len(planes), 3)), np.empty(len(planes)), np.empty(len(planes))
     for plane in planes:
         count = len(kept)
-        normal, offset, low, high, corners, sides = plane
+        normal, offset, low, high, corners = plane
         cosine = normals[:count] @ normal
         off = np.abs(np.sign(cosine) * offset - offsets[:count])
         equal = np.flatnonzero((np.abs(cosine) > 1 - 1e-9) & (off < 2e-6 * sizes[:count]))
         place = equal[0] if len(equal) else count
         if len(equal):
-            n, c, a, b, before, sides_before = kept[place]
+            n, c, a, b, before = kept[place]
             both = _rectangle(n, c, np.concatenate((before, corners)))
-            sides = sides_before | (sides if cosine[place] > 0 else sides[::-1])
-            kept[place] = (n, c, np.minimum(a, low), np.maximum(b, high), both, sides)
+            kept[place] = (n, c, np.minimum(a, low), np.maximum(b, high), both)
         else:
             kept.append(plane)
             normals[place], offsets[place] = normal, offset
@@ -201,45 +189,6 @@ def glint_sequences(mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
             rows = planes[np.indices((len(planes),) * order).reshape(order, -1).T]
             found.append(rows[(rows[:, 1:] != rows[:, :-1]).all(axis=1)])
     return found
-
-
-def image_sequences(mirrors: Mirrors, laser: np.ndarray, notes: list[str]) -> list[np.ndarray]:
-    """Return sequences (k,) of metal mirrors that may light the scene, the shorter ones first; k = 1 is nearest what
-    they light. `laser` is its position."""
-    metal = np.flatnonzero(mirrors.is_metal)
-    source = _sides(mirrors, metal, laser[None, None])[:, :, 0] & mirrors.sides[metal].T
-    lit = np.flatnonzero(source.any(axis=0))
-    if len(lit) > MAX_IMAGES:
-        notes.append(f"mirrors: the smallest {len(lit) - MAX_IMAGES} of {len(lit)} planes light no other surface")
-        edges = mirrors.corners[metal[lit], 1:3] - mirrors.corners[metal[lit], :1]
-        lit = np.sort(lit[np.argsort(-np.linalg.norm(edges, axis=2).prod(axis=1), kind="stable")[:MAX_IMAGES]])
-    # with each row, of places in `metal`, the sides of its first mirror that its light may leave by
-    rows: list[tuple[tuple[int, ...], np.ndarray]] = [((int(first),), source[:, first]) for first in lit]
-    found = [row for row, _ in rows]
-    faces = _sides(mirrors, metal, mirrors.corners[metal[:MAX_FACING]])
-    for order in range(2, MAX_ORDER + 1):
-        rows = [
-            ((place, *row), faces[:, place, row[0]] & mirrors.sides[metal[place]])
-            for row, sides in rows
-            for place in np.flatnonzero((sides[:, None] & faces[:, row[0]]).any(axis=0)).tolist()
-            if place != row[0]
-        ]
-        rows = [(row, sides) for row, sides in rows if sides.any()]
-        if len(found) + len(rows) > MAX_IMAGES or len(metal) > MAX_FACING:
-            ways = f"{len(rows)} ways among {len(metal)} planes"
-            notes.append(f"mirrored light by {order} or more mirrors left out: {ways}")
-            break
-        found += [row for row, _ in rows]
-    return [metal[list(row)] for row in found]
-
-
-def _sides(mirrors: Mirrors, planes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return whether any of some points (m, n, 3) lies before, and behind, planes by more than rounding: (2, planes,
-    m)."""
-    off = (mirrors.normal[planes] @ points.reshape(-1, 3).T).reshape(len(planes), *points.shape[:2])
-    off -= mirrors.offset[planes][:, None, None]
-    least = TOUCHING * np.abs(points).max(axis=2, initial=0)
-    return np.stack(((off > least).any(axis=2), (off < -least).any(axis=2)))
 
 
 def image_of(mirrors: Mirrors, sequence: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -10,7 +10,8 @@ import pytest
 from render import RenderSettings, render
 from render.scene.traced_scene import TracedScene
 from render.specular.image_method import specular_light
-from render.specular.mirrors import MAX_ORDER, find_mirrors, image_sequences
+from render.specular.image_sequences import image_sequences
+from render.specular.mirrors import MAX_ORDER, find_mirrors
 from scenes import Camera, Laser, Material, Scene, Surface
 from scenes.geometry.shapes import box, sphere
 
@@ -148,40 +149,52 @@ def test_a_highlight_in_a_mirror_does_not_hang_on_chance(seed):
     assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want)
 
 
+def ways(surfaces: tuple, laser: Laser) -> tuple[list, list[str]]:
+    """Sequences of mirrors that light of a laser takes, and the notes."""
+    world = TracedScene(Scene("ways", surfaces, view(), laser))
+    mirrors, notes = find_mirrors(world)
+    return image_sequences(world, mirrors, notes), notes
+
+
 def test_a_mirror_lights_no_mirror_behind_it():
-    """Of a closed box the laser lights its outer sides alone, and none of these lights another; with a plane before
-    it, each pair that faces each other does."""
+    """Of a box the laser lights three sides alone, and none of these lights another; a plane before it and the side
+    that faces it light each other, up to MAX_ORDER times."""
     vertices, faces, uv = box((1.0, 1.0, 0.1))
     body = Surface(vertices + (0, 0, -3), faces, MIRROR, uv=uv)
     before = quad([(-0.4, -0.4, 1), (0.4, -0.4, 1), (0.4, 0.4, 1), (-0.4, 0.4, 1)], MIRROR)
-    for surfaces, expected in (((body,), (3,)), ((body, before), (4, 2, 2))):
-        scene = Scene("box", surfaces, view(), Laser(baseline_m=(5, 6, 0)))
-        mirrors, notes = find_mirrors(TracedScene(scene))
-        rows = image_sequences(mirrors, scene.laser.position(scene.camera), notes)
-        assert tuple(np.bincount([len(row) for row in rows])[1:]) == expected, rows
+    laser = Laser("flood", (0.6, 0.6, 0), 360.0)
+    assert [len(row) for row in ways((body,), laser)[0]] == [1, 1, 1]
+    rows, _ = ways((body, before), laser)
+    assert [len(row) for row in rows].count(1) == 4 and {len(row) for row in rows} <= {1, 2, 3}
+    facing = [row for row in rows if len(row) == 2]
+    assert len(facing) == 2 and set(facing[0]) == set(facing[1]) and (facing[0] == facing[1][::-1]).all()
 
 
-def test_light_of_a_laser_inside_a_box_of_mirrors_meets_its_inner_sides():
+def test_light_of_a_laser_inside_a_box_of_mirrors_goes_by_all_ways():
+    """A corner's three sides light each other in any order, and opposite sides do."""
     vertices, faces, uv = box((2.0, 2.0, 2.0))
     for wound in (faces, faces[:, ::-1]):
-        scene = Scene("inside", (Surface(vertices, wound, MIRROR, uv=uv),), view(), Laser())
-        mirrors, notes = find_mirrors(TracedScene(scene))
-        rows = image_sequences(mirrors, np.zeros(3), notes)
-        assert tuple(np.bincount([len(row) for row in rows])[1:]) == (6, 30), rows
+        rows, notes = ways((Surface(vertices, wound, MIRROR, uv=uv),), Laser("flood", (0.1, 0.2, 0.3), 360.0))
+        lengths = [len(row) for row in rows]
+        assert lengths.count(1) == 6 and lengths.count(2) == 30
+        assert len(rows) == 64 and any("ways by mirrors are left out" in note for note in notes)
 
 
-def test_of_very_many_mirrors_the_largest_light_others():
+def test_sequences_are_in_order_from_what_they_light_to_the_laser():
+    """The laser shines on the first mirror alone, which shows it to the second."""
+    first = quad([(-1, -1, -3), (1, -1, -3), (1, 1, -3), (-1, 1, -3)], MIRROR)
+    second = quad([(-4, -4, 2), (4, -4, 2), (4, 4, 2), (-4, 4, 2)], MIRROR)
+    shade = quad([(-4, -4, 1.9), (-1.2, -4, 1.9), (-1.2, 4, 1.9), (-4, 4, 1.9)], WALL)
+    world = TracedScene(Scene("order", (first, second, shade), view(), Laser()))
+    mirrors, notes = find_mirrors(world)
+    rows = [tuple(mirrors.offset[row]) for row in image_sequences(world, mirrors, notes) if len(row) == 2]
+    assert {tuple(np.abs(row)) for row in rows} == {(2.0, 3.0), (3.0, 2.0)}
+
+
+def test_of_very_many_mirrors_those_that_most_light_meets_light_others():
     centres = [(x, y, -5.0) for x in np.linspace(-2, 2, 12) for y in np.linspace(-2, 2, 12)]
-    sizes = np.full(len(centres), 0.02)
-    sizes[100] = 0.2
     square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
     tilted = square @ np.array([(1, 0, 0.3), (0, 1, 0.2), (0, 0, 1)])
-    surfaces = tuple(
-        quad(list(tilted * size + centre + (0, 0, 0.01 * k)), MIRROR)
-        for k, (size, centre) in enumerate(zip(sizes, centres, strict=True))
-    )
-    mirrors, notes = find_mirrors(TracedScene(Scene("many", surfaces, view(), Laser())))
-    rows = image_sequences(mirrors, np.zeros(3), notes)
-    largest = np.argmax(mirrors.high[:, 0] - mirrors.low[:, 0])
-    assert len(rows) == 64 and largest in np.concatenate(rows)
-    assert any("the smallest 80 of 144 planes" in note for note in notes)
+    surfaces = tuple(quad(list(tilted * 0.1 + centre + (0, 0, 0.01 * k)), MIRROR) for k, centre in enumerate(centres))
+    rows, notes = ways(surfaces, Laser("flood", cone_deg=360.0))
+    assert len(rows) == 64 and any("of 144 ways by mirrors are left out" in note for note in notes)
