@@ -64,7 +64,7 @@ def classical_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
 
 def code_of(name: str) -> tuple[str, int] | None:
     """Return a temporal code and its number by a name such as fourier-16; None for another name."""
-    found = re.fullmatch(r"([a-z-]+?)-(\d{1,4})", name)
+    found = re.fullmatch(r"([a-z-]+?)-(\d{1,9})", name)
     return (found[1], int(found[2])) if found is not None and found[1] in CODES else None
 
 

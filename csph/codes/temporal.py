@@ -57,7 +57,7 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
         "gray": lambda: gray_fourier(codes, bins, block_pulse(bins, sensor)),
         "coarse": lambda: coarse_gates(codes, bins),
         "hadamard": lambda: walsh_hadamard(codes, bins),
-        "random": lambda: uniform_start((codes, bins), bins, seed),
+        "random": lambda: _random(codes, bins, seed),
         "fourier-published": lambda: truncated_fourier(codes, bins, "published"),
         "gray-published": lambda: gray_fourier(codes, bins, published_pulse(bins, sensor), "published"),
     }
@@ -66,6 +66,11 @@ def temporal_code(name: str, codes: int, bins: int, sensor: Sensor, seed: int = 
     whole = isinstance(codes, Integral) and not isinstance(codes, bool) and codes >= 1
     require(whole, f"{name} code: {codes!r} codes, expected a whole number, 1 or more")
     return makers[name]()
+
+
+def _random(codes: int, bins: int, seed: int) -> Tensor:
+    require(codes <= bins, f"random code: {codes} codes, the limit is one a bin, {bins}")
+    return uniform_start((codes, bins), bins, seed)
 
 
 def truncated_fourier(codes: int, bins: int, rows: Rows = "centred") -> Tensor:

@@ -79,7 +79,9 @@ class CodingTensor:
         if self.steps is not None:
             self._check_steps(self.steps)
         size = self.bins * self.rows * self.columns
-        require(self.codes <= size, f"coding tensor {self.name}: {self.codes} codes of a block of {size} counts")
+        require(
+            self.codes <= size, f"coding tensor {self.name}: {self.codes} codes of a block of {size} counts, the limit"
+        )
 
     def _check_steps(self, steps: object) -> None:
         """Make the steps a pair of numbers. Raises InputError unless both parts are whole steps within +-LEVELS."""

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from csph import CodingTensor, decode_depth, encode, encode_timestamps, truncated_fourier
+from csph import CodingTensor, decode_depth, encode, encode_timestamps, temporal_code, truncated_fourier
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S as C
 from scenes.errors import InputError
 from spad.estimators.depth import cramer_rao_m, grid_peak
@@ -62,6 +62,11 @@ def test_fourier_refuses_other_numbers_of_codes(codes: int) -> None:
     with pytest.raises(InputError, match=rf"{codes} codes, expected an even number from 2 to 62") as caught:
         truncated_fourier(codes, 64)
     assert "\n" not in str(caught.value)
+
+
+def test_more_random_codes_than_bins_are_refused_before_they_are_drawn() -> None:
+    with pytest.raises(InputError, match="random code: 900000000 codes, the limit is one a bin, 1024"):
+        temporal_code("random", 900_000_000, 1024, REFERENCE)
 
 
 def test_coding_tensor_knows_its_size() -> None:

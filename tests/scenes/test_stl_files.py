@@ -66,3 +66,22 @@ def test_colours_of_some_faces_are_noted(tmp_path: Path) -> None:
         scene = loaded(tmp_path, binary(attributes=attributes))
         assert scene.surfaces[0].material.albedo == 0.6
         assert any(f"a: {note}" in one for one in scene.notes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("vertex 1 1 0", "vertex 1 one 0", "line 7: 'vertex 1 one 0', expected vertex and three numbers"),
+        ("vertex 1 0 0", "vertex 1 0", "line 6: 'vertex 1 0', expected"),
+        ("vertex 0 1 0", "VERTEX 0 1 0 2", "line 14: 'vertex 0 1 0 2', expected"),
+    ],
+)
+def test_a_vertex_that_is_no_point_is_refused_with_its_line(tmp_path: Path, old: str, new: str, said: str) -> None:
+    """The line is that of the file, words before the solid counted in."""
+    assert said in refusal(tmp_path, ("written by hand\n" + text().replace(old, new, 1)).encode())
+
+
+def test_numbers_of_a_text_may_be_written_in_any_way(tmp_path: Path) -> None:
+    content = text().replace("vertex 1 1 0", "vertex +1.0E+0 .1e1 -0.")
+    corners = loaded(tmp_path, content.encode()).surfaces[0]
+    assert len(corners.faces) == 2

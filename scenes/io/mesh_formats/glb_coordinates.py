@@ -76,7 +76,7 @@ def dense_accessors(header: JsonObject, binary: bytes) -> bytes:
         count, width = accessor["count"], _WIDTHS[accessor["type"]]
         sparse = accessor["sparse"]
         parts = {**sparse["indices"], "type": "SCALAR"}, {**accessor, "byteOffset": 0, **sparse["values"]}
-        where = f"the {sparse['count']} sparse numbers of accessor {number}"
+        where = f"sparse part of accessor {number}"
         places, values = (_elements(header, binary, {**one, "count": sparse["count"]}, where) for one in parts)
         base = None
         if "bufferView" in accessor:
@@ -84,7 +84,7 @@ def dense_accessors(header: JsonObject, binary: bytes) -> bytes:
         if places is None or values is None or ("bufferView" in accessor and base is None):
             continue
         rows = np.zeros((count, width), values.dtype) if base is None else base.copy()
-        require(places.dtype.kind == "u" and int(places.max()) < count, f"{where} reach beyond its {count} elements")
+        require(places.dtype.kind == "u" and int(places.max()) < count, f"{where} reaches beyond its {count} elements")
         rows[places[:, 0]] = values
         plain = _appended(header, made, rows)
         kept = {key: value for key, value in accessor.items() if key not in ("sparse", "byteOffset")}

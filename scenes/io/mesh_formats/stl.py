@@ -11,6 +11,8 @@ from scenes.errors import InputError, require
 
 STL_HEADER = 80  # bytes before the number of triangles
 _STL_START, _STL_TRIANGLE = 84, 50
+_NUMBER = rb"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|\.\d+(?:e[-+]?\d+)?|nan|inf(?:inity)?)"
+_NO_POINT = re.compile(rb"^[ \t]*vertex\b(?!(?:[ \t]+%s){3}[ \t]*$).*$" % _NUMBER, re.MULTILINE)  # in small letters
 
 
 def plain_stl(content: bytes) -> tuple[bytes, int]:
@@ -31,16 +33,20 @@ def plain_stl(content: bytes) -> tuple[bytes, int]:
     start = re.search(rb"^[ \t]*solid\b", text, re.MULTILINE | re.IGNORECASE)
     if start is None:
         raise InputError("is no STL: neither binary, nor text with a line that begins with solid")
-    text = text[start.start() :]
-    return text, _check_stl_text(text.lower())
+    before, text = text[: start.start()], text[start.start() :]
+    return text, _check_stl_text(text.lower(), before.count(b"\n") + 1)
 
 
-def _check_stl_text(text: bytes) -> int:
+def _check_stl_text(text: bytes, first_line: int) -> int:
     words = ("solid", "endsolid", "facet", "endfacet", "vertex")
     counts = {word: len(re.findall(rb"^[ \t]*%s\b" % word.encode(), text, re.MULTILINE)) for word in words}
     whole = counts["solid"] == counts["endsolid"] and counts["facet"] == counts["endfacet"]
     whole = whole and counts["vertex"] == 3 * counts["facet"]
     require(whole, f"cut short or damaged: {', '.join(f'{count} {word}' for word, count in counts.items())}")
+    wrong = _NO_POINT.search(text)
+    if wrong is not None:
+        line, found = first_line + text.count(b"\n", 0, wrong.start()), wrong[0].strip()[:40].decode(errors="replace")
+        raise InputError(f"line {line}: {found!r}, expected vertex and three numbers")
     return counts["facet"]
 
 
