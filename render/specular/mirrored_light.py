@@ -5,9 +5,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from render.backend.drjit_types import Array, Floats, Rays, UInts, Vectors
-from render.scene.rays import camera_rays, first_opaque, in_beam, shape_index, spawn, spreading, tangent_motion
+from render.scene.rays import (
+    camera_rays,
+    first_opaque,
+    in_beam,
+    shape_index,
+    spawn,
+    spreading,
+    tangent_motion,
+)
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 from render.specular.mirrors import MAX_ORDER, Mirrors, image_of
 from render.specular.unfolded_ways import MirrorTables, connect_to_image, reflectance
@@ -46,8 +55,10 @@ def mirrored_light(
             pixel, radiance = (np.concatenate([part[k] for part in found]) for k in (0, 3))
             own = np.bincount(pixel, radiance, uneven.size)
             most = fraction * math.hypot(other, float(np.linalg.norm(own)))
-        uneven = _too_uneven(_unevenness(found, uneven.size, side), most)
-        uneven[narrow] |= side == grid
+            # what a pixel shows may reach into its neighbours, between their cells
+            shown = np.isin(np.arange(uneven.size), narrow).reshape(camera.height, camera.width)
+            beside = binary_dilation(shown, np.ones((3, 3))).ravel()
+        uneven = _too_uneven(_unevenness(found, uneven.size, side), most) | (beside & (side == grid))
         uneven &= side < sides[-1]
         parts += (merge(select(part, ~uneven[part.pixel]), 0 if side == grid else FINER_M) for part in found)
         if not uneven.any():
@@ -105,7 +116,8 @@ def _too_uneven(unevenness: np.ndarray, allowed: float) -> np.ndarray:
 def _cells(
     world: TracedScene, tables: MirrorTables, pixels: np.ndarray, grid: int, target: UInts, planes: list[Array]
 ) -> tuple[Array, ...]:
-    """Trace cells of pixels; return path, half width [m], radiance / cells, mirrors met, and if polished and lit.
+    """Trace cells of pixels; return path, half width [m], radiance / cells, mirrors met, and if polished (and
+    lit by a flood).
 
     And how far each is from the middle of a highlight: the half vector beside the normal, in units of the roughness.
     """
@@ -129,18 +141,20 @@ def _cells(
     direction = along / length
     lift = si.n * dr.select(dr.dot(si.n, direction) > 0, 1e-5, -1e-5) * (length + dr.norm(si.p - world.eye))
     passed, delay, shortening, last = connect_to_image(world, tables, (si.p, lift, target), planes, active, False)
-    active &= in_beam(world, last, pixel)
-    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), active)[0]
-    intensity = dr.gather(Float, world.intensity, pixel, active)
+    lit = active & in_beam(world, last, pixel)
+    # between cells a narrow beam may meet what they show beside it
+    polished = (lit if world.scene.laser.mode == "flood" else active) & (passed > 0)
+    polished &= dr.gather(Float, world.glossy_materials, shape_index(si), polished) > 0
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), lit)[0]
+    intensity = dr.gather(Float, world.intensity, pixel, lit)
     radiance = weight * value * passed * intensity * spreading(length, shortening) / dr.square(length) / Float(cells)
     path = optical + length + delay
     half_width = _half_width(local, axes, si.n, -direction, distance, pitch / world.focal_px)
     half_width = dr.minimum(half_width, WIDEST_SPREAD * path)
-    polished = active & (passed > 0) & (dr.gather(Float, world.glossy_materials, shape_index(si), active) > 0)
     half = dr.normalize(si.to_local(direction) + si.wi)
     off_peak = si.to_world(half * dr.sign(half.z)) - si.sh_frame.n
     off_peak /= dr.maximum(dr.gather(Float, world.roughness, shape_index(si), polished), 1e-6)
-    return path, half_width, dr.select(active & dr.isfinite(radiance), radiance, 0), met, polished, off_peak
+    return path, half_width, dr.select(lit & dr.isfinite(radiance), radiance, 0), met, polished, off_peak
 
 
 @dr.syntax

@@ -149,6 +149,23 @@ def test_a_highlight_in_a_mirror_does_not_hang_on_chance(seed):
     assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want)
 
 
+@pytest.mark.parametrize("mode", ["flood", "line", "scan"])
+def test_a_needle_between_cells_is_found_by_what_its_neighbours_show(mode):
+    """A chrome needle of a fifth of a pixel, seen in a mirror by 3 cells a side, against 160."""
+    points, faces, _ = sphere(1.0, 5)
+    size = np.array((0.008, 0.4, 0.008))
+    turn = np.array([(1, 0, 0), (0, math.cos(0.3), math.sin(0.3)), (0, -math.sin(0.3), math.cos(0.3))])
+    normals = points / size / np.linalg.norm(points / size, axis=1, keepdims=True)
+    chrome = Material("roughconductor", roughness=0.05, eta=2.9, k=3.1)
+    needle = Surface((points * size) @ turn.T + (2, 0, -2), faces, chrome, normals=normals @ turn.T)
+    mirror = quad([(-2, -3, 0), (2, -3, -4), (2, 3, -4), (-2, 3, 0)], MIRROR)
+    laser = Laser("flood", cone_deg=360.0) if mode == "flood" else Laser(mode)
+    world = TracedScene(Scene("needle", (mirror, needle), view(), laser))
+    fine, found = (specular_light(world, side, allowed=(a, 0.0)).samples for side, a in ((160, 0.0), (3, 1e-3)))
+    want, got = (by_pixel(world.scene, one, one.bounces > 1) for one in (fine, found))
+    assert np.linalg.norm(got - want) < 0.02 * np.linalg.norm(want) and want.any()
+
+
 def ways(surfaces: tuple, laser: Laser) -> tuple[list, list[str]]:
     """Sequences of mirrors that light of a laser takes, and the notes."""
     world = TracedScene(Scene("ways", surfaces, view(), laser))
