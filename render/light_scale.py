@@ -1,7 +1,7 @@
 """Units of an image's indirect light: where its paths are counted from, and the light that its amount is compared with.
 
-Both are the direct light's. Where no pixel, or hardly any, is lit directly, a pilot's indirect light takes its place: a
-laser behind a corner, or a mirror that fills the view.
+Both are the direct light's, that which mirrors show among it. Where no pixel, or hardly any, has such light, a pilot's
+indirect light takes its place: of a laser behind a corner.
 """
 
 from __future__ import annotations

@@ -134,7 +134,8 @@ def trace(
     rays, indirect, schedule = direct.rays, None, None
     scale, reasons = LightScale(np.zeros(len(pixels)), 0.0, no_samples()), tuple[str, ...]()
     if plan.bounces > 1:
-        scale = light_scale(world, plan, direct.samples, derived_seed(seed, Stream.PILOT, 0, 1))
+        seen = concatenate([direct.samples, specular.shown])
+        scale = light_scale(world, plan, seen, derived_seed(seed, Stream.PILOT, 0, 1))
     if scale.brightest > 0:
         schedule, reasons = planned_schedule(world, plan, settings, scale.light, scale.origin_m, seed)
     light = SampleBuffer()
@@ -204,7 +205,8 @@ def planned_schedule(
     world: TracedScene, plan: Plan, settings: RenderSettings, direct: Samples, origin_m: np.ndarray, seed: int
 ) -> tuple[Schedule, tuple[str, ...]]:
     """Allocate paths to pixels by the noise of a pilot of a few paths, which is not used again; return the schedule and
-    the reasons for it. Targets and clamps are counted in the `direct` light, or what is there in place of it."""
+    the reasons for it. Targets and clamps are counted in the `direct` light, that which mirrors show among it, or what
+    is there in place of it."""
     clamp = None
     if plan.clamp is not None:
         camera = world.scene.camera

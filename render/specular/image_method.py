@@ -30,10 +30,12 @@ from render.transient.samples import Samples, concatenate, merge, no_samples
 
 
 class SpecularLight(NamedTuple):
-    """Samples of specular light, and what was left out or is inexact, one line each."""
+    """Samples of specular light; what was left out or is inexact, one line each; and those samples, not merged, that
+    mirrors show of directly lit surfaces."""
 
     samples: Samples
     notes: tuple[str, ...]
+    shown: Samples
 
 
 def specular_light(
@@ -61,7 +63,7 @@ def specular_light(
     """
     notes = check_slabs(world)
     if not any(surface.material.kind in COATED for surface in world.scene.surfaces):
-        return SpecularLight(no_samples(), tuple(notes))
+        return SpecularLight(no_samples(), tuple(notes), no_samples())
     mirrors, more = find_mirrors(world)
     notes += more
     tables = MirrorTables(world, mirrors, bounces)
@@ -69,10 +71,11 @@ def specular_light(
     for sequences in glint_sequences(mirrors, notes):
         if sequences.shape[1] <= bounces:
             parts.append(glints(world, tables, mirrors, sequences[lit[sequences[:, -1]]]))
-    of_mirrors = [row for row in image_sequences(world, mirrors, notes) if lit[row[-1]]]
-    if world.has_mirrors:
-        of_mirrors.insert(0, np.zeros(0, np.int64))
-    for sequence in of_mirrors:
-        if max(len(sequence), 1) < bounces:  # a mirror, and the surface that is lit
+    shown = []
+    if world.has_mirrors and bounces > 1:
+        shown = mirrored_light(world, tables, mirrors, np.zeros(0, np.int64), grid, allowed)
+    for sequence in image_sequences(world, mirrors, notes):
+        if lit[sequence[-1]] and len(sequence) < bounces:  # and the surface that is lit
             parts += mirrored_light(world, tables, mirrors, sequence, grid, allowed)
-    return SpecularLight(merge(concatenate(parts), tolerance_m), tuple(notes))
+    merged = merge(concatenate([*parts, *shown]), tolerance_m)
+    return SpecularLight(merged, tuple(notes), concatenate([no_samples(), *shown]))

@@ -14,6 +14,7 @@ from render.planning import MIN_BOUNCES, cone_width_px, make_plan
 from render.reference import path_traced
 from render.scene.traced_scene import TracedScene
 from render.settings import RenderSettings
+from render.specular.image_method import specular_light
 from render.transient.samples import Samples
 from scene2spad.bench.hard import oracles
 from scenes import Camera, InputError, Laser, Material, Scene, Surface
@@ -47,12 +48,10 @@ def in_a_mirror() -> Scene:
     return Scene("mirror", (room(), mirror), looking((0, 0, 0), (0, 0, 1), 40), Laser("flood", cone_deg=360))
 
 
-@pytest.mark.parametrize(
-    "scene", [behind_a_panel(), pytest.param(in_a_mirror(), marks=pytest.mark.slow)], ids=["panel", "mirror"]
-)
-def test_indirect_light_is_there_where_no_pixel_is_lit_directly(scene):
+def test_indirect_light_is_there_where_no_pixel_is_lit_directly():
     """Against plain path tracing. Pixels of a block share their paths: a sum's error is up to 4 times the pixels'."""
-    settings, world = RenderSettings(bounces=3, spp=64), TracedScene(scene)
+    scene, settings = behind_a_panel(), RenderSettings(bounces=3, spp=64)
+    world = TracedScene(scene)
     traced = trace(world, make_plan(world, settings, 1), settings, seed=1)
     assert len(traced.direct.pixel) == 0 and traced.indirect is not None
     total, error = traced.indirect_samples.radiance.sum(), 4 * np.linalg.norm(traced.indirect.noise)
@@ -62,6 +61,21 @@ def test_indirect_light_is_there_where_no_pixel_is_lit_directly(scene):
     found = render(scene, settings, seed=1)
     assert found.meta["relative_error"]["monte_carlo"] > 0
     assert any("hardly any direct light" in reason for reason in found.meta["plan"]["reasons"])
+
+
+@pytest.mark.slow
+def test_a_mirror_that_fills_the_view_shows_what_its_light_is_compared_with():
+    """Against plain path tracing, which finds all but what the mirror throws on walls; that is later."""
+    scene, settings = in_a_mirror(), RenderSettings(bounces=3, spp=64)
+    world = TracedScene(scene)
+    traced = trace(world, make_plan(world, settings, 1), settings, seed=1)
+    assert len(traced.direct.pixel) == 0 and traced.indirect is not None
+    assert not any("hardly any direct light" in reason for reason in traced.reasons)
+    shown = specular_light(world, 16, bounces=2).shown.radiance.sum(dtype=float)
+    total, error = traced.indirect_samples.radiance.sum() + shown, 4 * np.linalg.norm(traced.indirect.noise)
+    seeds = [path_traced(scene, np.array([0.0, 100.0]), bounces=3, spp=128, seed=seed).sum() for seed in range(4)]
+    error = np.hypot(error, np.std(seeds, ddof=1) / 2)
+    assert abs(total - np.mean(seeds)) < 4 * error and error < 0.02 * total
 
 
 @pytest.mark.parametrize("laser", [Laser(cone_deg=25), Laser(baseline_m=(1.5, 0, 0))], ids=["cone", "shadow"])
