@@ -134,7 +134,7 @@ def trace(
     rays, indirect, schedule = direct.rays, None, None
     scale, reasons = LightScale(np.zeros(len(pixels)), 0.0, no_samples()), tuple[str, ...]()
     if plan.bounces > 1:
-        seen = concatenate([direct.samples, specular.shown])
+        seen = concatenate([direct.samples, specular.shown]) if len(specular.shown.pixel) else direct.samples
         scale = light_scale(world, plan, seen, derived_seed(seed, Stream.PILOT, 0, 1))
     if scale.brightest > 0:
         schedule, reasons = planned_schedule(world, plan, settings, scale.light, scale.origin_m, seed)
