@@ -81,6 +81,9 @@ def _dask_client(address: str) -> Iterator[Client]:
         except (OSError, ValueError, TypeError) as error:
             message = " ".join(str(error).split())[:120]
             raise InputError(f"scheduler {address}: cannot be reached ({message or type(error).__name__})") from None
+        except AssertionError:  # of Dask, whose thread of its own had 10 s to start
+            message = "Dask's event loop did not start in 10 s: try again when the machine is less busy"
+            raise InputError(f"scheduler {address}: cannot be reached ({message})") from None
         try:
             yield client
         finally:

@@ -24,6 +24,18 @@ def test_a_scheduler_that_is_not_there_is_one_line_and_leaves_no_folder(tmp_path
     assert not (tmp_path / "set").exists()
 
 
+def test_a_machine_too_busy_for_dask_is_told_so_in_one_line(tmp_path, monkeypatch):
+    """Dask asserts that its thread has started in 10 s."""
+    distributed = pytest.importorskip("distributed")
+
+    def too_busy(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr(distributed, "Client", too_busy)
+    with pytest.raises(InputError, match=r"scheduler tcp://x:1: cannot be reached \(Dask's event loop did not start"):
+        make_set(JOB, 1, tmp_path / "set", scheduler="tcp://x:1")
+
+
 def test_a_finished_set_does_not_hide_a_scheduler_that_is_not_there(tmp_path):
     pytest.importorskip("distributed")
     make_set(JOB, 1, tmp_path / "set")
