@@ -124,10 +124,10 @@ def trace(
     trim = partial(trim_memory, len(pixels)) if plan.bounces > 1 else lambda: None
     trim()
     radiance = np.bincount(direct.samples.pixel, weights=direct.samples.radiance, minlength=len(pixels))
-    uneven = UNEVEN, float(np.linalg.norm(radiance))
+    allowed = UNEVEN, float(np.linalg.norm(radiance))
     # the image method finds light of more surfaces than asked for, too
     most = MAX_BOUNCES if settings.bounces is None else settings.bounces
-    specular = specular_light(world, plan.grid, plan.direct_tolerance_m, uneven, most)
+    specular = specular_light(world, plan.grid, plan.direct_tolerance_m, allowed, most)
     trim()
     mirrored = np.bincount(specular.samples.pixel, weights=specular.samples.radiance, minlength=len(pixels))
     checked = NOT_CHECKED if pilot is None else checked_pixels(pilot, radiance + mirrored)

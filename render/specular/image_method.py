@@ -1,4 +1,4 @@
-"""Light by way of plane mirrors, which path tracing finds by chance or not at all.
+"""Light by way of mirrors, which path tracing finds by chance or not at all.
 
 The image method gives it all. Light that reaches a point by way of plane mirrors 1 ... k (1 nearest the point) runs
 along the unfolded straight line to the laser's image L' = S_1 S_2 ... S_k L, where S_i reflects in plane i.

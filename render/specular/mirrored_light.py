@@ -1,4 +1,4 @@
-"""Mirrored light: what the camera sees, directly or by way of mirrors, lit by way of mirrors."""
+"""Mirrored light: what the camera sees by way of mirrors, and what it sees lit by way of mirrors."""
 
 from __future__ import annotations
 
@@ -56,8 +56,9 @@ def mirrored_light(
             own = np.bincount(pixel, radiance, uneven.size)
             most = fraction * math.hypot(other, float(np.linalg.norm(own)))
             # what a pixel shows may reach into its neighbours, between their cells
-            shown = np.isin(np.arange(uneven.size), narrow).reshape(camera.height, camera.width)
-            beside = binary_dilation(shown, np.ones((3, 3))).ravel()
+            beside = np.zeros((camera.height, camera.width), bool)
+            beside.flat[narrow] = True
+            beside = binary_dilation(beside, np.ones((3, 3))).ravel()
         uneven = _too_uneven(_unevenness(found, uneven.size, side), most) | (beside & (side == grid))
         uneven &= side < sides[-1]
         parts += (merge(select(part, ~uneven[part.pixel]), 0 if side == grid else FINER_M) for part in found)

@@ -1,4 +1,4 @@
-"""What a laser lights directly and the camera sees by way of mirrors: traced cell by cell, not by chance."""
+"""Check what a laser lights directly and mirrors show: it is traced cell by cell, not met by chance."""
 
 from __future__ import annotations
 
@@ -167,15 +167,15 @@ def test_a_needle_between_cells_is_found_by_what_its_neighbours_show(mode):
 
 
 def ways(surfaces: tuple, laser: Laser) -> tuple[list, list[str]]:
-    """Sequences of mirrors that light of a laser takes, and the notes."""
+    """Return the sequences of mirrors that light of a laser takes, and the notes."""
     world = TracedScene(Scene("ways", surfaces, view(), laser))
     mirrors, notes = find_mirrors(world)
     return image_sequences(world, mirrors, notes), notes
 
 
 def test_a_mirror_lights_no_mirror_behind_it():
-    """Of a box the laser lights three sides alone, and none of these lights another; a plane before it and the side
-    that faces it light each other, up to MAX_ORDER times."""
+    """Find three lit sides of a box, none of which lights another; a plane before it and the side that faces it light
+    each other, up to MAX_ORDER times."""
     vertices, faces, uv = box((1.0, 1.0, 0.1))
     body = Surface(vertices + (0, 0, -3), faces, MIRROR, uv=uv)
     before = quad([(-0.4, -0.4, 1), (0.4, -0.4, 1), (0.4, 0.4, 1), (-0.4, 0.4, 1)], MIRROR)
@@ -215,3 +215,22 @@ def test_of_very_many_mirrors_those_that_most_light_meets_light_others():
     surfaces = tuple(quad(list(tilted * 0.1 + centre + (0, 0, 0.01 * k)), MIRROR) for k, centre in enumerate(centres))
     rows, notes = ways(surfaces, Laser("flood", cone_deg=360.0))
     assert len(rows) == 64 and any("of 144 ways by mirrors are left out" in note for note in notes)
+
+
+def test_of_hundreds_of_mirrors_single_ones_light_others():
+    """Leave out ways over two mirrors, and say so, where there are more planes than are looked through."""
+    vertices, faces, uv = box((0.1, 0.1, 0.1))
+    centres = [(x, y, -5.0) for x in np.linspace(-2, 2, 8) for y in np.linspace(-2, 2, 8)]
+    apart = np.array((0.001, 0.002, 0.01))
+    surfaces = tuple(Surface(vertices + centre + k * apart, faces, MIRROR, uv=uv) for k, centre in enumerate(centres))
+    rows, notes = ways(surfaces, Laser("flood", cone_deg=360.0))
+    assert {len(row) for row in rows} == {1}
+    assert any("ways by two or more of" in note and "the limit is 256 planes" in note for note in notes)
+
+
+def test_degenerate_and_hidden_mirrors_light_nothing():
+    flat = Surface(np.zeros((3, 3)) + (0, 0, -2), [[0, 1, 2]], MIRROR)
+    assert ways((flat, quad([(-1, -1, -3), (1, -1, -3), (1, 1, -3), (-1, 1, -3)], WALL)), Laser())[0] == []
+    hidden = quad([(-1, -1, -4), (1, -1, -4), (1, 1, -4), (-1, 1, -4)], MIRROR)
+    front = quad([(-9, -9, -3), (9, -9, -3), (9, 9, -3), (-9, 9, -3)], WALL)
+    assert ways((front, hidden), Laser("flood", cone_deg=360.0))[0] == []
