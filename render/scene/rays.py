@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from render.backend.drjit_types import Array, Floats, Generators, Interactions, Masks, Rays, UInts, Vectors
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi
 
@@ -9,6 +11,7 @@ MAX_LAYERS = 64  # of glass and cut-outs that one ray passes
 MIN_SHADING_COSINE = 1e-4
 # Of the largest coordinate from the camera: float32 hardly tells apart what is closer.
 TOUCHING = 5e-7
+PARALLEL = 1 - 1e-6  # cosine between two faces of a slab, as float32 rounds it
 BEFORE_END = 1e-4  # of a ray's length: so far before its end nothing stops it
 
 
@@ -126,27 +129,72 @@ def first_opaque(
         distance = si.t if origin is None else dr.norm(si.p - origin)
         return si, Float(1), distance, distance
     start = ray.o if origin is None else origin
-    return _pass_layers(world, ray, start, active, None, origin is None, coherent)[:4]
+    return _pass_layers(world, ray, start, active, origin is None, coherent)[:4]
+
+
+def glass_faces(world: TracedScene, ray: Rays) -> Array:
+    """Count the faces of glass that a camera ray passes, two of a slab, before what stops it."""
+    return _pass_layers(world, ray, ray.o, Bool(True), True, True).faces
+
+
+def glass_ahead(world: TracedScene, ray: Rays, number: UInts) -> tuple[Array, Array, Array, Array, Array]:
+    """Find the place where a camera ray meets the face of glass of this number, from 0 on.
+
+    Returns the interaction, transmission, optical path and geometric distance, as `first_opaque` does, and whether
+    there is such a face and light that it reflects goes in a straight line (`Layers.reflects`).
+    """
+    found = _pass_layers(world, ray, ray.o, Bool(True), True, True, (None, number))
+    shape, there = shape_index(found.si), found.si.is_valid()
+    glass = dr.gather(Float, world.solid_ior, shape, there) + dr.gather(Float, world.thin_ior, shape, there) > 0
+    return *found[:4], glass & found.reflects(found.si.n)
+
+
+class Layers(NamedTuple):
+    """What a ray passes and what stops it: see `first_opaque`, and `_pass_layers` for what comes after the distance."""
+
+    si: Interactions
+    transmission: Floats
+    optical: Floats
+    distance: Floats
+    shortening: Floats
+    medium: Floats
+    entry: Vectors
+    faces: UInts
+
+    def reflects(self, normal: Vectors) -> Array:
+        """Tell whether the way reflected at the end, by a face of glass of this normal, is the straight one: a ray
+        inside glass has to leave it by a face parallel to that by which it came in."""
+        return (self.medium <= 1) | (dr.abs(dr.dot(self.entry, normal)) > PARALLEL)
 
 
 @dr.syntax
 def _pass_layers(
-    world: TracedScene, ray: Rays, origin: Vectors, active: Masks, limit: Floats | None, in_air: bool, coherent: bool
-) -> tuple[Array, ...]:
-    """Trace `first_opaque` through layers, no farther than `limit`; where nothing stops the ray the paths run there.
+    world: TracedScene,
+    ray: Rays,
+    origin: Vectors,
+    active: Masks,
+    in_air: bool,
+    coherent: bool,
+    ends: tuple[Floats | None, UInts | None] = (None, None),
+) -> Layers:
+    """Trace `first_opaque` through layers, up to the `ends`: a limit, where the paths run to if nothing
+    stops the ray, and the face of glass of some number, from 0 on.
 
     A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
     ray that starts at a surface may start inside glass: the side of its first interface tells. A ray that meets more
-    than MAX_LAYERS is lost. The fifth result is the distance by which glass shortens the geometric spreading, the sum
-    of t (1 - 1/n) (see `spreading`).
+    than MAX_LAYERS is lost.
+    `shortening` is the distance by which glass shortens the geometric spreading, the sum of t (1 - 1/n) (see
+    `spreading`); `medium` is the index of refraction before the end, `entry` the normal of the last face of solid glass
+    passed, and `faces` the number of faces of glass passed.
     """
     lanes = dr.width(ray.d)
     transmission, optical, distance = dr.full(Float, 1, lanes), dr.zeros(Float, lanes), dr.zeros(Float, lanes)
-    shortening = dr.zeros(Float, lanes)
+    shortening, entry = dr.zeros(Float, lanes), dr.zeros(mi.Normal3f, lanes)
     medium = dr.full(Float, 1 if in_air else 0, lanes)  # index of refraction on the way, 0 = not known yet
-    layer = dr.zeros(UInt32, lanes)
+    layer, faces = dr.zeros(UInt32, lanes), dr.zeros(UInt32, lanes)
     ray, start, line = mi.Ray3f(ray), mi.Point3f(origin), mi.Vector3f(ray.d)
-    limit, bounded = (Float(dr.inf), False) if limit is None else (limit, True)
+    (limit, last), bounded, stopped = ends, ends[0] is not None, ends[1] is not None
+    limit, last = limit if bounded else Float(dr.inf), last if stopped else UInt32(0)
     end = start + line * limit if bounded else start
     found = dr.zeros(mi.PreliminaryIntersection3f, lanes)
     found.t = dr.full(Float, dr.inf, lanes)
@@ -158,6 +206,9 @@ def _pass_layers(
         solid = dr.gather(Float, world.solid_ior, shape_index(found), hit)
         thin = dr.gather(Float, world.thin_ior, shape_index(found), hit)
         glass = hit & ((solid > 0) | (thin > 0))
+        if dr.hint(stopped, mode="scalar"):
+            glass &= faces != last
+        faces += dr.select(glass, UInt32(1), UInt32(0))
         # all about a point is worked out where light may pass, and in the end where it does not
         si = found.compute_surface_interaction(ray, mi.RayFlags.All, hit if world.has_cutouts else glass)
         cosine = dr.dot(ray.d, si.n)
@@ -168,13 +219,15 @@ def _pass_layers(
         medium = dr.select(interface & (medium == 0), dr.select(cosine > 0, solid, 1), medium)
         passing = Bool(glass)
         if dr.hint(world.has_cutouts, mode="scalar"):
-            passing |= hit & ~glass & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
+            stops = (solid > 0) | (thin > 0)
+            passing |= hit & ~stops & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
         # measured from the start: every new ray begins a little off the surface
         reached = dr.select(passing, dr.dot(si.p - start, line), distance)
         optical += (reached - distance) * dr.maximum(medium, 1)
         shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
         distance = reached
         medium = dr.select(interface, dr.select(medium == 1, solid, 1), medium)
+        entry = dr.select(interface, si.n, entry)
         ray.o = dr.select(passing, spawn(si, line).o, ray.o)
         if dr.hint(bounded, mode="scalar"):  # it begins beside its line: so what the end lies on does not stop it
             ray.d = dr.select(passing, dr.normalize(end - ray.o), ray.d)
@@ -187,7 +240,7 @@ def _pass_layers(
     reached = dr.select(si.is_valid(), dr.dot(si.p - start, line), limit)
     optical += (reached - distance) * dr.maximum(medium, 1)
     shortening += dr.select(medium > 1, (reached - distance) * (1 - dr.rcp(medium)), 0)
-    return si, transmission, optical, reached, shortening
+    return Layers(si, transmission, optical, reached, shortening, medium, entry, faces)
 
 
 def laser_leg(
@@ -298,12 +351,28 @@ def passage(
     `ray` starts at or a little off `origin`; `in_air` says that it starts outside of all glass, else its first
     interface tells.
     """
+    return passage_to_face(world, ray, origin, limit, active, None, in_air=in_air)[:3]
+
+
+def passage_to_face(
+    world: TracedScene,
+    ray: Rays,
+    origin: Vectors,
+    limit: Floats,
+    active: Masks,
+    normal: Vectors | None,
+    *,
+    in_air: bool,
+) -> tuple[Array, Array, Array, Array]:
+    """Return what `passage` returns, and whether the straight way is that of light which a face of glass of this
+    `normal` reflects at its end (`Layers.reflects`)."""
     if not world.sees_through:
         ray = mi.Ray3f(ray)
         ray.maxt = limit
-        return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), limit, Float(0)
-    end, transmission, optical, _, shortening = _pass_layers(world, ray, origin, active, limit, in_air, in_air)
-    return dr.select(end.is_valid(), 0, transmission), optical, shortening
+        return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), limit, Float(0), Bool(True)
+    found = _pass_layers(world, ray, origin, active, in_air, in_air, (limit, None))
+    reflects = Bool(True) if normal is None else found.reflects(normal)
+    return dr.select(found.si.is_valid(), 0, found.transmission), found.optical, found.shortening, reflects
 
 
 def shading_ratio(si: Interactions, local: Vectors) -> Array:

@@ -9,6 +9,7 @@ Mirrored light: what the camera sees by way of mirrors; and what it sees lit by 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +17,8 @@ import numpy as np
 from render.scene.traced_scene import TracedScene
 from render.settings import MAX_BOUNCES
 from render.specular.glints import glints
-from render.specular.image_sequences import image_sequences
-from render.specular.mirrored_light import mirrored_light
+from render.specular.image_sequences import image_sequences, pane_sequences
+from render.specular.mirrored_light import Ways, faces_of_glass, mirrored_light
 from render.specular.mirrors import (
     COATED,
     check_slabs,
@@ -25,8 +26,10 @@ from render.specular.mirrors import (
     glint_sequences,
     lit_mirrors,
 )
-from render.specular.unfolded_ways import MirrorTables
+from render.specular.unfolded_ways import mirror_tables
 from render.transient.samples import Samples, concatenate, merge, no_samples
+
+MAX_FACES = 8  # of glass along a ray of the camera, each of which reflects
 
 
 class SpecularLight(NamedTuple):
@@ -66,16 +69,23 @@ def specular_light(
         return SpecularLight(no_samples(), tuple(notes), no_samples())
     mirrors, more = find_mirrors(world)
     notes += more
-    tables = MirrorTables(world, mirrors, bounces)
+    tables = mirror_tables(world, mirrors)
     parts, lit = [no_samples()], lit_mirrors(world, mirrors)
     for sequences in glint_sequences(mirrors, notes):
         if sequences.shape[1] <= bounces:
             parts.append(glints(world, tables, mirrors, sequences[lit[sequences[:, -1]]]))
-    shown = []
-    if world.has_mirrors and bounces > 1:
-        shown = mirrored_light(world, tables, mirrors, np.zeros(0, np.int64), grid, allowed)
-    for sequence in image_sequences(world, mirrors, notes):
-        if lit[sequence[-1]] and len(sequence) < bounces:  # and the surface that is lit
-            parts += mirrored_light(world, tables, mirrors, sequence, grid, allowed)
+    lighting = [*image_sequences(world, mirrors, notes), *pane_sequences(world, mirrors, notes)]
+    lighting = [planes for planes in lighting if lit[planes[-1]] and len(planes) < bounces]  # and the surface lit
+    straight, every = np.zeros(0, np.int64), np.arange(world.scene.camera.height * world.scene.camera.width)
+    trace = partial(mirrored_light, world, tables, mirrors, grid=grid, allowed=allowed)
+    shown = trace(Ways(straight, every, bounces)) if world.has_mirrors and bounces > 1 else []
+    for planes in lighting:
+        parts += trace(Ways(planes, every, bounces))
+    faces = faces_of_glass(world, grid) if bounces > 1 else np.zeros(len(every))
+    if faces.max() > MAX_FACES:
+        notes.append(f"glass: what faces reflect beyond the first {MAX_FACES} along a ray is left out")
+    for face in range(min(int(faces.max()), MAX_FACES)):
+        for planes in (straight, *(planes for planes in lighting if len(planes) == 1 and bounces > 2)):
+            parts += trace(Ways(planes, np.flatnonzero(faces > face), bounces, face))
     merged = merge(concatenate([*parts, *shown]), tolerance_m)
     return SpecularLight(merged, tuple(notes), concatenate([no_samples(), *shown]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -11,6 +12,8 @@ from render.backend.drjit_types import Array, Floats, Rays, UInts, Vectors
 from render.scene.rays import (
     camera_rays,
     first_opaque,
+    glass_ahead,
+    glass_faces,
     in_beam,
     shape_index,
     spawn,
@@ -28,29 +31,80 @@ RESOLVED = 0.5  # of a lobe's width between neighbouring cells: those that are n
 WIDEST_SPREAD = 0.25  # of the path: a footprint that spans more describes no mesh
 
 
+class Ways(NamedTuple):
+    """Ways of light: the planes (k,) by which the laser's light comes, from what they light to the laser; the flat
+    pixels looked at, sorted; the most surfaces met; and the number of the face of glass, from 0 on, that the camera
+    looks by (None: it looks straight, or by mirrors)."""
+
+    planes: np.ndarray
+    pixels: np.ndarray
+    bounces: int
+    face: int | None = None
+
+
+def faces_of_glass(world: TracedScene, grid: int) -> np.ndarray:
+    """Count the faces of glass before what each pixel shows, the most over its cells, (pixels,)."""
+    camera = world.scene.camera
+    pixels = camera.height * camera.width
+    if not world.has_glass:
+        return np.zeros(pixels, np.uint32)
+    found, per_chunk = [], max(1, CELLS_PER_LAUNCH // grid**2)
+    for first in range(0, pixels, per_chunk):
+        chunk = np.arange(first, min(first + per_chunk, pixels))
+        faces = world.recordings.call(world, "faces of glass", _faces, *_launch(chunk, grid))
+        dr.eval(faces)
+        found.append(faces.numpy().reshape(-1, grid * grid).max(axis=1))
+    return np.concatenate(found)
+
+
+def _faces(world: TracedScene, lane: UInts, pixels: UInts, side: UInts) -> Array:
+    _, x, y, _ = _places(world, lane, pixels, side)
+    return glass_faces(world, camera_rays(world, x, y)[0])
+
+
+def _places(world: TracedScene, lane: UInts, pixels: UInts, side: UInts) -> tuple[Array, ...]:
+    """Return pixel, position and pitch of side x side cells of each of the pixels, a lane a cell."""
+    cells = side * side
+    pixel, cell = dr.gather(UInt32, pixels, lane // cells), lane % cells
+    pitch = 1 / Float(side)
+    x = Float(pixel % world.width) + (Float(cell % side) + 0.5) * pitch
+    y = Float(pixel // world.width) + (Float(cell // side) + 0.5) * pitch
+    return pixel, x, y, pitch
+
+
+def _launch(pixels: np.ndarray, grid: int) -> tuple[Array, Array, Array]:
+    """Return lanes of grid x grid cells of pixels, the pixels, and the grid, as Dr.Jit arrays."""
+    lane = dr.arange(UInt32, len(pixels) * grid * grid)
+    dr.eval(lane)
+    # one more: an array of a single value would compile other kernels
+    return lane, upload(UInt32, np.append(pixels, 0)), dr.opaque(UInt32, grid)
+
+
 def mirrored_light(
     world: TracedScene,
     tables: MirrorTables,
     mirrors: Mirrors,
-    sequence: np.ndarray,
+    ways: Ways,
     grid: int,
     allowed: tuple[float, float],
 ) -> list[Samples]:
-    """Trace what the camera sees, directly or by way of up to MAX_ORDER mirrors, lit by way of the mirror planes
-    `sequence` (k,); of k = 0 what it sees by way of mirrors, which the laser lights directly.
+    """Trace what the camera sees by these ways: directly or by way of up to MAX_ORDER mirrors, of which a face of glass
+    may be the first; without planes only by way of mirrors or such a face.
 
     Pixels whose cells are uneven get FINER ones, until the root sum square of what the others' means may be off by is
     within `allowed`: such a fraction (0: not asked) of that of this light and of other light together.
     """
     fraction, other = allowed
     camera, laser = world.scene.camera, world.scene.laser
-    image = image_of(mirrors, sequence[None], laser.position(camera) - camera.origin)[0]
+    image = image_of(mirrors, ways.planes[None], laser.position(camera) - camera.origin)[0]
     target = mi.Point3f(*(dr.opaque(Float, float(v)) for v in image + world.eye_m))
-    planes = [dr.opaque(UInt32, int(plane)) for plane in sequence]
-    uneven, parts = np.full(camera.height * camera.width, True), list[Samples]()
+    numbers = ways.planes, [] if ways.face is None else [ways.face]
+    looked_up = tuple(tables), target, *(tuple(dr.opaque(UInt32, int(one)) for one in part) for part in numbers)
+    uneven, parts = np.zeros(camera.height * camera.width, bool), list[Samples]()
+    uneven[ways.pixels] = True
     sides = (grid, *(side for side in FINER if side > grid and fraction > 0))
     for side in sides:
-        found, narrow = _of_pixels(world, tables, np.flatnonzero(uneven), side, target, planes)
+        found, narrow = _of_pixels(world, looked_up, np.flatnonzero(uneven), side, ways)
         if side == grid:
             pixel, radiance = (np.concatenate([part[k] for part in found]) for k in (0, 3))
             own = np.bincount(pixel, radiance, uneven.size)
@@ -68,19 +122,22 @@ def mirrored_light(
 
 
 def _of_pixels(
-    world: TracedScene, tables: MirrorTables, pixels: np.ndarray, grid: int, target: UInts, planes: list[Array]
+    world: TracedScene, looked_up: tuple[Array, ...], pixels: np.ndarray, grid: int, ways: Ways
 ) -> tuple[list[Samples], np.ndarray]:
     """Return mirrored light of some pixels, a sample a lit cell, launch by launch; and which pixels may have a
-    highlight between their cells."""
+    highlight between their cells. `looked_up` is what `_cells` looks up.
+    """
     cells, parts, narrow = grid * grid, [], []
     per_chunk = max(1, CELLS_PER_LAUNCH // cells)
     for first in range(0, len(pixels), per_chunk):
         chunk = pixels[first : first + per_chunk]
-        path, half_width, radiance, met, polished, off_peak = _cells(world, tables, chunk, grid, target, planes)
+        key = "mirrored light", len(ways.planes), ways.face is None
+        found = world.recordings.call(world, key, _cells, _launch(chunk, grid), *looked_up)
+        path, half_width, radiance, met, polished, off_peak = found
         dr.eval(path, half_width, radiance, met, polished, off_peak)
         narrow.append(chunk[_may_miss_highlights(np.array(polished), np.array(off_peak), grid)])
-        radiance, bounces = np.array(radiance, dtype=np.float64), np.array(met) + 1 + len(planes)
-        lit = (radiance > 0) & (bounces <= tables.bounces)
+        radiance, bounces = np.array(radiance, dtype=np.float64), np.array(met) + 1 + len(ways.planes)
+        lit = (radiance > 0) & (bounces <= ways.bounces)
         path, half_width = (np.array(value, dtype=np.float64)[lit] for value in (path, half_width))
         met_in_all = bounces[lit].astype(np.uint8)
         parts.append(Samples(np.repeat(chunk, cells)[lit], path, half_width, radiance[lit], met_in_all))
@@ -115,23 +172,21 @@ def _too_uneven(unevenness: np.ndarray, allowed: float) -> np.ndarray:
 
 
 def _cells(
-    world: TracedScene, tables: MirrorTables, pixels: np.ndarray, grid: int, target: UInts, planes: list[Array]
+    world: TracedScene,
+    launch: tuple[Array, Array, Array],
+    columns: tuple[Array, ...],
+    target: Vectors,
+    planes: tuple[UInts, ...],
+    face: tuple[UInts, ...],
 ) -> tuple[Array, ...]:
     """Trace cells of pixels; return path, half width [m], radiance / cells, mirrors met, and if polished (and
     lit by a flood).
 
     And how far each is from the middle of a highlight: the half vector beside the normal, in units of the roughness.
     """
-    side, lanes = dr.opaque(UInt32, grid), len(pixels) * grid * grid
-    lane = dr.arange(UInt32, lanes)
-    cells = side * side
-    # one more: an array of a single value would compile other kernels
-    pixel, cell = dr.gather(UInt32, upload(UInt32, np.append(pixels, 0)), lane // cells), lane % cells
-    pitch = 1 / Float(side)
-    x = Float(pixel % world.width) + (Float(cell % side) + 0.5) * pitch
-    y = Float(pixel // world.width) + (Float(cell // side) + 0.5) * pitch
+    tables, (pixel, x, y, pitch) = MirrorTables(*columns), _places(world, *launch)
     ray, local = camera_rays(world, x, y)
-    si, weight, optical, distance, axes, met = _seen(world, tables, ray, lanes)
+    si, weight, optical, distance, axes, met = _seen(world, tables, ray, face)
     active = si.is_valid() & (weight > 0)
     active &= dr.gather(Float, world.mirrors, shape_index(si), active) == 0
     if not planes:
@@ -148,7 +203,8 @@ def _cells(
     polished &= dr.gather(Float, world.glossy_materials, shape_index(si), polished) > 0
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(direction), lit)[0]
     intensity = dr.gather(Float, world.intensity, pixel, lit)
-    radiance = weight * value * passed * intensity * spreading(length, shortening) / dr.square(length) / Float(cells)
+    radiance = weight * value * passed * intensity * spreading(length, shortening) / dr.square(length)
+    radiance *= dr.square(pitch)
     path = optical + length + delay
     half_width = _half_width(local, axes, si.n, -direction, distance, pitch / world.focal_px)
     half_width = dr.minimum(half_width, WIDEST_SPREAD * path)
@@ -159,19 +215,20 @@ def _cells(
 
 
 @dr.syntax
-def _seen(world: TracedScene, tables: MirrorTables, ray: Rays, lanes: int) -> tuple[Array, ...]:
+def _seen(world: TracedScene, tables: MirrorTables, ray: Rays, face: tuple[UInts, ...]) -> tuple[Array, ...]:
     """Find the first surface that is no mirror: interaction, weight of the way, optical and geometric length [m].
+
+    With a `face` the ray is mirrored by the face of glass of this number; where there is none its weight is 0.
 
     Also the camera's axes as the mirrors show them (the unfolded camera's frame; curved mirrors as their tangent
     planes) and the number of mirrors met.
     """
-    si, weight, optical, distance = first_opaque(world, ray, Bool(True))
-    weight = weight + dr.zeros(Float, lanes)
+    lanes = dr.width(ray.d)
+    si, weight, optical, distance, mirror = _first_met(world, ray, face)
+    weight, mirror = weight + dr.zeros(Float, lanes), mirror | dr.full(Bool, False, lanes)
     right, down, forward = (axis + dr.zeros(mi.Vector3f, lanes) for axis in world.axes)
     direction = mi.Vector3f(ray.d)
     met = dr.zeros(UInt32, lanes)
-    mirror = si.is_valid()
-    mirror &= dr.gather(Float, world.mirrors, shape_index(si), mirror) > 0
     while mirror & (met < MAX_ORDER):
         normal = mi.Vector3f(si.sh_frame.n)
         weight *= reflectance(tables, shape_index(si), dr.dot(normal, direction), mirror)
@@ -188,6 +245,16 @@ def _seen(world: TracedScene, tables: MirrorTables, ray: Rays, lanes: int) -> tu
         mirror = mirror & si.is_valid()
         mirror &= dr.gather(Float, world.mirrors, shape_index(si), mirror) > 0
     return si, weight, optical, distance, (right, down, forward), met
+
+
+def _first_met(world: TracedScene, ray: Rays, face: tuple[UInts, ...]) -> tuple[Array, ...]:
+    """Return what `first_opaque` does, and whether that is a mirror; with a `face` the same of that face of glass."""
+    if face:
+        si, weight, optical, distance, mirror = glass_ahead(world, ray, *face)
+        return si, dr.select(mirror, weight, 0), optical, distance, mirror
+    si, weight, optical, distance = first_opaque(world, ray, Bool(True))
+    mirror = si.is_valid()
+    return si, weight, optical, distance, mirror & (dr.gather(Float, world.mirrors, shape_index(si), mirror) > 0)
 
 
 def _half_width(

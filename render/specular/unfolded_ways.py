@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from render.backend.drjit_types import Array, Floats, Masks
-from render.scene.rays import passage, shape_index
+from render.backend.drjit_types import Array, Floats, Masks, UInts, Vectors
+from render.scene.rays import passage_to_face, shape_index
 from render.scene.traced_scene import OPACITY, Bool, Float, TracedScene, UInt32, dr, mi, upload
 from render.specular.mirrors import COATED, Mirrors
 
 
-class MirrorTables:
-    """Planes and, per registered shape, what decides a smooth reflectance, as Dr.Jit arrays; the most `bounces`."""
+class MirrorTables(NamedTuple):
+    """Planes and, per registered shape, what decides a smooth reflectance, as Dr.Jit arrays."""
 
-    def __init__(self, world: TracedScene, mirrors: Mirrors, bounces: int) -> None:
-        self.bounces = bounces
-        # one row more: an array of a single value would compile other kernels
-        columns = np.vstack((np.column_stack((mirrors.normal, mirrors.offset)), np.zeros(4)))
-        self.normal = mi.Vector3f(*(upload(Float, column) for column in columns[:, :3].T))
-        self.offset = upload(Float, columns[:, 3] + columns[:, :3] @ world.eye_m)
-        self.shape = upload(UInt32, np.append(mirrors.shape, 0))
-        materials = [group[0].material for group in world.groups]
-        self.scale = world.table([m.specular if m.kind in ("conductor", "plastic") else 1 for m in materials])
-        self.ior = world.table([m.ior for m in materials])
-        self.eta, self.k = world.table([m.eta for m in materials]), world.table([m.k for m in materials])
-        self.kind = world.table([COATED.index(m.kind) if m.kind in COATED else -1 for m in materials])
+    normal: Vectors
+    offset: Floats
+    shape: UInts
+    scale: Floats
+    ior: Floats
+    eta: Floats
+    k: Floats
+    kind: Floats
+
+
+def mirror_tables(world: TracedScene, mirrors: Mirrors) -> MirrorTables:
+    """Upload what `reflectance` and `connect_to_image` look up."""
+    # one row more: an array of a single value would compile other kernels
+    columns = np.vstack((np.column_stack((mirrors.normal, mirrors.offset)), np.zeros(4)))
+    normal = mi.Vector3f(*(upload(Float, column) for column in columns[:, :3].T))
+    offset = upload(Float, columns[:, 3] + columns[:, :3] @ world.eye_m)
+    materials = [group[0].material for group in world.groups]
+    scale = [m.specular if m.kind in ("conductor", "plastic") else 1 for m in materials]
+    kinds = [COATED.index(m.kind) if m.kind in COATED else -1 for m in materials]
+    of_shapes = scale, [m.ior for m in materials], [m.eta for m in materials], [m.k for m in materials], kinds
+    return MirrorTables(normal, offset, upload(UInt32, np.append(mirrors.shape, 0)), *map(world.table, of_shapes))
 
 
 def reflectance(tables: MirrorTables, shape: Array, cosine: Floats, active: Masks) -> Array:
@@ -61,7 +72,7 @@ def connect_to_image(
     position, lit = mi.Point3f(start), Bool(active)
     weight, delay, shortening = Float(1), Float(0), Float(0)
     for number, plane in enumerate((*sequence, None)):
-        step = left
+        step, normal = left, None
         if plane is not None:
             normal = dr.gather(mi.Vector3f, tables.normal, plane, lit)
             cosine = dr.dot(normal, direction)
@@ -73,12 +84,14 @@ def connect_to_image(
         way = position + (step - gap) * direction - begin
         limit = dr.norm(way)
         ray = mi.Ray3f(begin, way / limit)
-        passed, optical, short = passage(world, ray, begin, limit, lit, in_air=in_air and number == 0)
+        at_start = in_air and number == 0
+        passed, optical, short, reflects = passage_to_face(world, ray, begin, limit, lit, normal, in_air=at_start)
         weight *= passed
         delay += optical - limit
         shortening += short
         if plane is None:
             break
+        lit &= reflects
         position = position + step * direction
         # is there a face at that point of its plane?
         probe = dr.minimum(1e-4 * scale, 0.3 * step)
