@@ -6,6 +6,7 @@ indirect light takes its place: of a laser behind a corner.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,9 +15,10 @@ from render.direct.integrator import centre_layers
 from render.indirect.camera_paths import energy_by_bounces
 from render.indirect.integrator import IndirectTask, indirect_light, path_grid
 from render.indirect.launch_layout import block_order
+from render.indirect.light_vertices import sample_light_vertices
 from render.indirect.schedule import uniform
 from render.planning import pilot_pixels
-from render.scene.traced_scene import TracedScene
+from render.scene.traced_scene import TracedScene, UInt32, dr
 from render.settings import MIN_SPP, Plan
 from render.transient.samples import SampleBuffer, Samples
 
@@ -25,6 +27,7 @@ from render.transient.samples import SampleBuffer, Samples
 FEW_LIT, FAINT = 1 / 16, 2.0**10
 PILOT_SPP = 16, 256  # paths a pixel of the pilot, more where the first ones find nothing
 BRIGHTEST = 16.0  # radiance of the brightest pixel, in units of the mean: a guess
+LIT_LANES = 1 << 13  # paths for as many of which light vertices tell how bright the laser is
 
 
 class LightScale(NamedTuple):
@@ -56,7 +59,7 @@ def light_scale(world: TracedScene, plan: Plan, direct: Samples, seed: int) -> L
     if indirect <= FAINT * brightest:
         reason = f"indirect light: none, {paths} paths of a pilot found no light, and no pixel is lit directly"
         return LightScale(origin_m, brightest, direct, () if brightest > 0 else (reason,))
-    brightest = BRIGHTEST * indirect
+    brightest = max(BRIGHTEST * indirect, _brightest_lit(world))
     grid = path_grid(world, origin_m, brightest, plan.bounces, plan.indirect_tolerance_m, plan.indirect_growth)
     blocks, light = block_order(np.arange(pixels), world.scene.camera.width), SampleBuffer()
     schedule = uniform(blocks, MIN_SPP, reuses_paths=False)
@@ -74,6 +77,15 @@ def _mean_indirect(world: TracedScene, bounces: int, seed: int) -> tuple[float, 
         if energy > 0:
             break
     return energy / len(chosen), paths
+
+
+def _brightest_lit(world: TracedScene) -> float:
+    """Return what a white surface scatters where a flood laser is brightest: a few paths of a pilot may miss the spot
+    that others find, and sums would hold too little of it."""
+    if world.scene.laser.mode != "flood":
+        return 0.0
+    key = dr.opaque(UInt32, 0), dr.opaque(UInt32, 1)
+    return float(sample_light_vertices(world, LIT_LANES, 1, key).irradiance.numpy().max()) / math.pi
 
 
 def mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:

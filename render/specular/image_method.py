@@ -4,7 +4,8 @@ The image method gives it all. Light that reaches a point by way of plane mirror
 along the unfolded straight line to the laser's image L' = S_1 S_2 ... S_k L, where S_i reflects in plane i.
 
 Glints: the laser seen in mirrors, in the smooth coat of plastic and in the faces of glass.
-Mirrored light: what the camera sees by way of mirrors; and what it sees lit by way of mirrors.
+Mirrored light: what the camera sees by way of mirrors and of faces of glass; and what it sees lit by way of them, and
+of the coat of plastic.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ import numpy as np
 from render.scene.traced_scene import TracedScene
 from render.settings import MAX_BOUNCES
 from render.specular.glints import glints
-from render.specular.image_sequences import image_sequences, pane_sequences
-from render.specular.mirrored_light import Ways, faces_of_glass, mirrored_light
+from render.specular.image_sequences import coat_sequences, image_sequences
+from render.specular.mirrored_cells import faces_of_glass
+from render.specular.mirrored_light import Ways, mirrored_light
 from render.specular.mirrors import (
     COATED,
     check_slabs,
@@ -74,18 +76,17 @@ def specular_light(
     for sequences in glint_sequences(mirrors, notes):
         if sequences.shape[1] <= bounces:
             parts.append(glints(world, tables, mirrors, sequences[lit[sequences[:, -1]]]))
-    lighting = [*image_sequences(world, mirrors, notes), *pane_sequences(world, mirrors, notes)]
+    lighting = [*image_sequences(world, mirrors, notes), *coat_sequences(world, mirrors, notes)]
     lighting = [planes for planes in lighting if lit[planes[-1]] and len(planes) < bounces]  # and the surface lit
     straight, every = np.zeros(0, np.int64), np.arange(world.scene.camera.height * world.scene.camera.width)
     trace = partial(mirrored_light, world, tables, mirrors, grid=grid, allowed=allowed)
-    shown = trace(Ways(straight, every, bounces)) if world.has_mirrors and bounces > 1 else []
-    for planes in lighting:
-        parts += trace(Ways(planes, every, bounces))
+    shown = trace(Ways((straight,), every, bounces)) if world.has_mirrors and bounces > 1 else []
+    parts += trace(Ways(tuple(lighting), every, bounces)) if lighting else []
     faces = faces_of_glass(world, grid) if bounces > 1 else np.zeros(len(every))
     if faces.max() > MAX_FACES:
         notes.append(f"glass: what faces reflect beyond the first {MAX_FACES} along a ray is left out")
+    single = [planes for planes in lighting if len(planes) == 1 and bounces > 2]
     for face in range(min(int(faces.max()), MAX_FACES)):
-        for planes in (straight, *(planes for planes in lighting if len(planes) == 1 and bounces > 2)):
-            parts += trace(Ways(planes, np.flatnonzero(faces > face), bounces, face))
+        parts += trace(Ways((straight, *single), np.flatnonzero(faces > face), bounces, face))
     merged = merge(concatenate([*parts, *shown]), tolerance_m)
     return SpecularLight(merged, tuple(notes), concatenate([no_samples(), *shown]))

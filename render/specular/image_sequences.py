@@ -14,7 +14,7 @@ MAX_IMAGES = 64  # sequences
 # Rays a side of each face, and in all. A sequence that none of them takes is lit through less than a ten thousandth of
 # a face; of more than 32 faces, through more.
 RAYS_PER_SIDE, MAX_RAYS = 128, 1 << 19
-MAX_PANES = 16  # plane faces of glass
+MAX_COATS = 16  # plane faces of glass and of smooth plastic
 MAX_FACING = 256  # planes among which it is looked which one a mirrored ray meets
 ON_PLANE = 1e-5  # of the distance: what a hit may lie off a plane
 
@@ -39,28 +39,29 @@ def image_sequences(world: TracedScene, mirrors: Mirrors, notes: list[str]) -> l
     return [row[row >= 0] for row in rows[:MAX_IMAGES]]
 
 
-def pane_sequences(world: TracedScene, mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
-    """Return the planes of glass, a sequence (1,) each, that the laser may shine on.
+def coat_sequences(world: TracedScene, mirrors: Mirrors, notes: list[str]) -> list[np.ndarray]:
+    """Return the planes of glass and of smooth plastic, a sequence (1,) each, that the laser may shine on.
 
-    Of more than MAX_PANES those are taken that look largest from the laser; `notes` says so.
+    Of more than MAX_COATS those are taken that look largest from the laser; `notes` says so.
     """
     camera, laser = world.scene.camera, world.scene.laser
-    glass = np.flatnonzero(mirrors.is_glass)
-    corners = mirrors.corners[glass] - (laser.position(camera) - camera.origin)
+    coats = np.flatnonzero(~mirrors.is_metal)
+    corners = mirrors.corners[coats] - (laser.position(camera) - camera.origin)
     sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     middle = corners.mean(axis=1)
     distance = np.linalg.norm(middle, axis=1)
     radius = np.arctan2(np.linalg.norm(corners - middle[:, None], axis=-1).max(axis=1), distance)
-    lit = np.full(len(glass), True)
+    lit = np.full(len(coats), True)
     if laser.mode == "flood":
         off = np.arccos(np.clip(middle @ camera.rotation[:, 2] / np.maximum(distance, 1e-300), -1, 1))
         lit = off - radius <= laser.half_angle(camera)
-    area = np.linalg.norm(np.cross(*sides), axis=-1) * np.abs((mirrors.normal[glass] * middle).sum(axis=1))
+    area = np.linalg.norm(np.cross(*sides), axis=-1) * np.abs((mirrors.normal[coats] * middle).sum(axis=1))
     order = np.argsort(-area / np.maximum(distance, 1e-300) ** 3, kind="stable")
     order = order[lit[order]]
-    if len(order) > MAX_PANES:
-        notes.append(f"glass: light that {len(order) - MAX_PANES} of {len(order)} plane faces reflect is left out")
-    return [glass[[face]] for face in order[:MAX_PANES]]
+    if len(order) > MAX_COATS:
+        left_out = f"{len(order) - MAX_COATS} of {len(order)}"
+        notes.append(f"glass and smooth plastic: what {left_out} plane faces throw on other surfaces is left out")
+    return [coats[[face]] for face in order[:MAX_COATS]]
 
 
 def _sequences_of_rays(world: TracedScene, mirrors: Mirrors, metal: np.ndarray) -> np.ndarray:

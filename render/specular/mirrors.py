@@ -30,7 +30,8 @@ class Mirrors(NamedTuple):
     """Plane smooth faces n . x = c, the camera at the origin, (n,) or (n, 3) each.
 
     `low` and `high` bound the face, and so do the `corners` (n, 4, 3) of a rectangle in its plane; `shape` is its
-    mesh's registered index; `is_metal`, `is_glass` and `is_solid` (thick glass) its material.
+    mesh's registered index; `is_metal` and `is_solid` (thick glass) its material; all
+    others are glass and the coat of plastic.
     """
 
     normal: np.ndarray
@@ -40,7 +41,6 @@ class Mirrors(NamedTuple):
     corners: np.ndarray
     shape: np.ndarray
     is_metal: np.ndarray
-    is_glass: np.ndarray
     is_solid: np.ndarray
 
 
@@ -68,8 +68,7 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
             if found is None:
                 curved.setdefault(surface.name, None)
             planes += found or ()
-        material = kind == "conductor", group[0].material.is_glass, kind == "dielectric"
-        rows += [(*plane, shape, *material) for plane in _merged(planes)]
+        rows += [(*plane, shape, kind == "conductor", kind == "dielectric") for plane in _merged(planes)]
     if curved:
         notes.append(
             f"specular light: curved smooth surfaces ({listed(curved)}): glints and what they light are left out"
@@ -80,12 +79,12 @@ def find_mirrors(world: TracedScene) -> tuple[Mirrors, list[str]]:
             "glass: its own return and what it reflects of directly lit surfaces is rendered, no indirect light"
         )
     if "plastic" in kinds:
-        notes.append("smooth plastic: the laser's glint in its coat is rendered, not what is lit by way of the coat")
+        notes.append("smooth plastic: what its coat lights is rendered, not what that lights in turn")
     if any(row[6] for row in rows):
         notes.append("mirrors: light by way of them that meets two or more other surfaces first is left out")
-    of_none = [np.empty((0, *shape)) for shape in ((3,), (), (3,), (3,), (4, 3), (), (), (), ())]
+    of_none = [np.empty((0, *shape)) for shape in ((3,), (), (3,), (3,), (4, 3), (), (), ())]
     columns: list = list(zip(*rows, strict=True)) if rows else of_none
-    types = (float, float, float, float, float, np.int64, bool, bool, bool)
+    types = (float, float, float, float, float, np.int64, bool, bool)
     return Mirrors(*(np.array(c, dtype=t) for c, t in zip(columns, types, strict=True))), notes
 
 
