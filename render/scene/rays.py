@@ -144,13 +144,29 @@ def glass_ahead(world: TracedScene, ray: Rays, number: UInts) -> tuple[Array, Ar
     there is such a face and light that it reflects goes in a straight line (`Layers.reflects`).
     """
     found = _pass_layers(world, ray, ray.o, Bool(True), True, True, (None, number))
-    shape, there = shape_index(found.si), found.si.is_valid()
-    glass = dr.gather(Float, world.solid_ior, shape, there) + dr.gather(Float, world.thin_ior, shape, there) > 0
-    return *found[:4], glass & found.reflects(found.si.n)
+    solid, thin = _glass_of(world, found.si, found.si.is_valid())
+    return *found[:4], ((solid > 0) | (thin > 0)) & found.reflects(found.si.n)
+
+
+def _glass_of(world: TracedScene, si: Interactions, active: Masks) -> tuple[Array, Array]:
+    """Return the index of refraction of what was hit as solid glass, and as thin glass; 0: it is none."""
+    return tuple(dr.gather(Float, table, shape_index(si), active) for table in (world.solid_ior, world.thin_ior))
+
+
+def _crossing(cosine: Floats, solid: Floats, thin: Floats) -> Array:
+    """Return what a face of glass lets pass."""
+    fresnel = mi.fresnel(dr.abs(cosine), dr.maximum(dr.maximum(solid, thin), 1.0001))[0]
+    return dr.select(thin > 0, pane_transmittance(fresnel), 1 - fresnel)
 
 
 class Layers(NamedTuple):
-    """What a ray passes and what stops it: see `first_opaque`, and `_pass_layers` for what comes after the distance."""
+    """What a ray passes and what stops it, as `first_opaque` has it.
+
+    shortening  distance by which glass shortens the geometric spreading, the sum of t (1 - 1/n): `spreading`
+    medium      index of refraction before the end; 0: no face told it
+    entry       normal of the last face of solid glass passed
+    faces       number of faces of glass passed
+    """
 
     si: Interactions
     transmission: Floats
@@ -175,26 +191,18 @@ def _pass_layers(
     active: Masks,
     in_air: bool,
     coherent: bool,
-    ends: tuple[Floats | None, UInts | None] = (None, None),
+    ends: tuple[Floats | None, UInts | int] = (None, MAX_LAYERS),
 ) -> Layers:
-    """Trace `first_opaque` through layers, up to the `ends`: a limit, where the paths run to if nothing
-    stops the ray, and the face of glass of some number, from 0 on.
-
-    A camera starts `in_air`, and every interface of solid glass then leads in or out, whichever way its faces point. A
-    ray that starts at a surface may start inside glass: the side of its first interface tells. A ray that meets more
-    than MAX_LAYERS is lost.
-    `shortening` is the distance by which glass shortens the geometric spreading, the sum of t (1 - 1/n) (see
-    `spreading`); `medium` is the index of refraction before the end, `entry` the normal of the last face of solid glass
-    passed, and `faces` the number of faces of glass passed.
-    """
+    """Trace `first_opaque` through layers, up to the `ends`: a limit, where paths run to if nothing stops the ray, and
+    the face of glass of some number. A camera starts `in_air`, and every interface of solid glass then leads in or out,
+    whichever way its faces point. Else the ray may start in glass: the side of its first interface tells."""
     lanes = dr.width(ray.d)
     transmission, optical, distance = dr.full(Float, 1, lanes), dr.zeros(Float, lanes), dr.zeros(Float, lanes)
     shortening, entry = dr.zeros(Float, lanes), dr.zeros(mi.Normal3f, lanes)
     medium = dr.full(Float, 1 if in_air else 0, lanes)  # index of refraction on the way, 0 = not known yet
     layer, faces = dr.zeros(UInt32, lanes), dr.zeros(UInt32, lanes)
     ray, start, line = mi.Ray3f(ray), mi.Point3f(origin), mi.Vector3f(ray.d)
-    (limit, last), bounded, stopped = ends, ends[0] is not None, ends[1] is not None
-    limit, last = limit if bounded else Float(dr.inf), last if stopped else UInt32(0)
+    bounded, limit, last = ends[0] is not None, Float(dr.inf) if ends[0] is None else ends[0], UInt32(ends[1])
     end = start + line * limit if bounded else start
     found = dr.zeros(mi.PreliminaryIntersection3f, lanes)
     found.t = dr.full(Float, dr.inf, lanes)
@@ -203,24 +211,19 @@ def _pass_layers(
         ray.maxt = limit - dr.dot(ray.o - start, line)
         found = world.mi_scene.ray_intersect_preliminary(ray, coherent=coherent, active=searching)
         hit = searching & found.is_valid()
-        solid = dr.gather(Float, world.solid_ior, shape_index(found), hit)
-        thin = dr.gather(Float, world.thin_ior, shape_index(found), hit)
-        glass = hit & ((solid > 0) | (thin > 0))
-        if dr.hint(stopped, mode="scalar"):
-            glass &= faces != last
+        solid, thin = _glass_of(world, found, hit)
+        of_glass = hit & ((solid > 0) | (thin > 0))
+        glass = of_glass & (faces != last)
         faces += dr.select(glass, UInt32(1), UInt32(0))
         # all about a point is worked out where light may pass, and in the end where it does not
         si = found.compute_surface_interaction(ray, mi.RayFlags.All, hit if world.has_cutouts else glass)
         cosine = dr.dot(ray.d, si.n)
-        fresnel = mi.fresnel(dr.abs(cosine), dr.maximum(dr.maximum(solid, thin), 1.0001))[0]
-        crossing = dr.select(thin > 0, pane_transmittance(fresnel), 1 - fresnel)
-        transmission = dr.select(glass, transmission * crossing, transmission)
+        transmission = dr.select(glass, transmission * _crossing(cosine, solid, thin), transmission)
         interface = glass & (solid > 0)
         medium = dr.select(interface & (medium == 0), dr.select(cosine > 0, solid, 1), medium)
         passing = Bool(glass)
         if dr.hint(world.has_cutouts, mode="scalar"):
-            stops = (solid > 0) | (thin > 0)
-            passing |= hit & ~stops & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
+            passing |= hit & ~of_glass & (si.shape.eval_attribute_1(OPACITY, si, hit) < 0.5)
         # measured from the start: every new ray begins a little off the surface
         reached = dr.select(passing, dr.dot(si.p - start, line), distance)
         optical += (reached - distance) * dr.maximum(medium, 1)
@@ -233,7 +236,7 @@ def _pass_layers(
             ray.d = dr.select(passing, dr.normalize(end - ray.o), ray.d)
         layer += 1
         searching = passing & (layer < MAX_LAYERS)
-        lost = passing & ~searching
+        lost = passing & ~searching  # among more layers
         found.t = dr.select(lost, dr.inf, found.t)
         transmission = dr.select(lost, 0, transmission)
     si = found.compute_surface_interaction(ray, mi.RayFlags.All, active & found.is_valid())
@@ -370,7 +373,7 @@ def passage_to_face(
         ray = mi.Ray3f(ray)
         ray.maxt = limit
         return dr.select(world.mi_scene.ray_test(ray, active), Float(0), Float(1)), limit, Float(0), Bool(True)
-    found = _pass_layers(world, ray, origin, active, in_air, in_air, (limit, None))
+    found = _pass_layers(world, ray, origin, active, in_air, in_air, (limit, MAX_LAYERS))
     reflects = Bool(True) if normal is None else found.reflects(normal)
     return dr.select(found.si.is_valid(), 0, found.transmission), found.optical, found.shortening, reflects
 

@@ -72,9 +72,9 @@ def _refined(
     pixel, radiance = (np.concatenate([part[k] for part in traced.parts]) for k in (0, 3))
     most = fraction * math.hypot(other, float(np.linalg.norm(np.bincount(pixel, radiance, pixels))))
     # what a pixel shows may reach into its neighbours, between their cells
-    finer = np.zeros((camera.height, camera.width), bool)
-    finer.flat[np.concatenate(traced.narrow)] = True
-    finer = binary_dilation(finer, np.ones((3, 3))).ravel()
+    narrow = np.zeros((camera.height, camera.width), bool)
+    narrow.flat[np.concatenate(traced.narrow)] = True
+    finer = binary_dilation(narrow, np.ones((3, 3))).ravel()
     sides = (grid, *(side for side in FINER if side > grid and fraction > 0))
     for side in sides:
         finer = (finer | _too_uneven(_unevenness(traced.parts, pixels, side), most)) & (side < sides[-1])
@@ -104,8 +104,9 @@ def _of_pixels(
             narrow.append(chunk[_may_miss_highlights(polished, off_peak, grid)])
             bounces = met + 1 + len(sequence)
             lit = np.flatnonzero((radiance > 0) & (bounces <= ways.bounces))
-            columns = (values[lit].astype(np.float64) for values in (path, half_width, radiance))
-            parts.append(Samples(chunk[lit // grid**2], *columns, bounces[lit].astype(np.uint8)))
+            path, half_width, radiance = (values[lit].astype(float) for values in (path, half_width, radiance))
+            number = bounces[lit].astype(np.uint8)
+            parts.append(Samples(chunk[lit // grid**2], path, half_width, radiance, number))
     return traced
 
 

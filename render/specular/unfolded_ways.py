@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +36,8 @@ def mirror_tables(world: TracedScene, mirrors: Mirrors) -> MirrorTables:
     scale = [m.specular if m.kind in ("conductor", "plastic") else 1 for m in materials]
     kinds = [COATED.index(m.kind) if m.kind in COATED else -1 for m in materials]
     of_shapes = scale, [m.ior for m in materials], [m.eta for m in materials], [m.k for m in materials], kinds
-    return MirrorTables(normal, offset, upload(UInt32, np.append(mirrors.shape, 0)), *map(world.table, of_shapes))
+    columns_of_shapes = (world.table(list(values)) for values in of_shapes)
+    return MirrorTables(normal, offset, upload(UInt32, np.append(mirrors.shape, 0)), *columns_of_shapes)
 
 
 def reflectance(tables: MirrorTables, shape: Array, cosine: Floats, active: Masks) -> Array:
@@ -54,7 +56,7 @@ def connect_to_image(
     world: TracedScene,
     tables: MirrorTables,
     ends: tuple[Array, Array, Array],
-    sequence: list[Array],
+    sequence: Sequence[Array],
     active: Masks,
     in_air: bool,
 ) -> tuple[Array, Array, Array, Array]:
