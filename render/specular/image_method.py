@@ -10,6 +10,7 @@ of the coat of plastic.
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -78,15 +79,18 @@ def specular_light(
             parts.append(glints(world, tables, mirrors, sequences[lit[sequences[:, -1]]]))
     lighting = [*image_sequences(world, mirrors, notes), *coat_sequences(world, mirrors, notes)]
     lighting = [planes for planes in lighting if lit[planes[-1]] and len(planes) < bounces]  # and the surface lit
+    single = [planes for planes in lighting if len(planes) == 1 and bounces > 2]
     straight, every = np.zeros(0, np.int64), np.arange(world.scene.camera.height * world.scene.camera.width)
-    trace = partial(mirrored_light, world, tables, mirrors, grid=grid, allowed=allowed)
-    shown = trace(Ways((straight,), every, bounces)) if world.has_mirrors and bounces > 1 else []
-    parts += trace(Ways(tuple(lighting), every, bounces)) if lighting else []
     faces = faces_of_glass(world, grid) if bounces > 1 else np.zeros(len(every))
     if faces.max() > MAX_FACES:
         notes.append(f"glass: what faces reflect beyond the first {MAX_FACES} along a ray is left out")
-    single = [planes for planes in lighting if len(planes) == 1 and bounces > 2]
-    for face in range(min(int(faces.max()), MAX_FACES)):
+    by_faces = min(int(faces.max()), MAX_FACES)
+    # the squares of what ways may be off by add up
+    fraction = allowed[0] / math.sqrt(1 + len(lighting) + by_faces * (1 + len(single)))
+    trace = partial(mirrored_light, world, tables, mirrors, grid=grid, allowed=(fraction, allowed[1]))
+    shown = trace(Ways((straight,), every, bounces)) if world.has_mirrors and bounces > 1 else []
+    parts += trace(Ways(tuple(lighting), every, bounces)) if lighting else []
+    for face in range(by_faces):
         parts += trace(Ways((straight, *single), np.flatnonzero(faces > face), bounces, face))
     merged = merge(concatenate([*parts, *shown]), tolerance_m)
     return SpecularLight(merged, tuple(notes), concatenate([no_samples(), *shown]))
