@@ -110,6 +110,8 @@ def limits(config: TrainConfig) -> tuple[str, ...]:
     """Return what a model trained so must not be used for."""
     model, sensor = config.model, config.model.sensor
     found = [f"histograms of other than {sensor.bins} bins of {sensor.bin_width_s * 1e12:.4g} ps, or another pulse"]
+    if sensor.tdc is not None:
+        found.append(f"histograms of another clock than that of {sensor.name}")
     found.append(f"photon levels far from its training's ({levels_in_words(config)})")
     reach, design = config.data.get("training_reach_m"), model.design
     long = design is not None and "temporal" in design.learned and design.block[0] > LONG_BLOCK

@@ -29,7 +29,8 @@ class Sense(Common):
     period: Number = None
     """Period of the laser [s], whole bins (default: the preset's, or what new --bins cover)."""
     signal: Number = None
-    """Mean signal photons per pixel and exposure (default: 50, or what the --radiometric optics give)."""
+    """Mean signal photons per pixel and exposure (default: 50, or what the --radiometric optics or a calibrated sensor
+    give)."""
     background: Number = None
     """Mean background photons per pixel and exposure, dark counts included (default: 50, or the sensor's dark
     counts if they are more, or what the --radiometric optics give)."""

@@ -1,4 +1,4 @@
-"""Read a periodic network near the ends of its range, where a posterior is on both."""
+"""Read a periodic network near the ends of its range, where a posterior is on both; and networks of other clocks."""
 
 from dataclasses import replace
 
@@ -51,3 +51,12 @@ def test_only_means_on_a_circle_are_warned_of(caplog):
     warn_of_ends("m", periodic, None)
     warn_of_ends("m", replace(periodic, network="compact"), "soft-argmax")
     assert not caplog.records
+
+
+def test_a_network_of_another_clock_is_warned_of(tmp_path, capfd):
+    for name, warned in (("learned-1024x1x1-128x-tdc-s0", True), ("learned-1024x1x1-128x-s0", False)):
+        write_histogram(wall_at(40.0, load_model(checkpoint_of(NAME))[0].config.sensor), tmp_path / "wall.h5")
+        asked = ["depth", str(tmp_path / "wall.h5"), "--method", "network", "--model", name, "--no-figure"]
+        assert main(asked) == 0
+        told = f"{name}: it was trained for the clock of reference-tdc, and this has bins of one width"
+        assert (told in capfd.readouterr().err) == warned

@@ -110,6 +110,7 @@ def run(command: Depth, progress: Progress) -> dict:
         require(not asked, message)
         histogram, sensed = open_for_depth(source, command.frame), ""
     progress(command.method, 0.1)
+    _warn_of_clock(command, network, histogram)
     result = _estimated(command, network, partial(_chosen_method, command), histogram, source, out)
     result = ({"sensed": sensed} if sensed else {}) | result
     return result if command.json else readable(result)
@@ -170,6 +171,8 @@ def _run_folder(command: Depth, label: str, progress: Progress) -> dict:
         progress(file.name, number / len(files))
         histogram, words = _sensed(command, input_file(file), command.seed + number)
         sensed = sensed or f"{words} and more, one for each"
+        if number == 0:
+            _warn_of_clock(command, network, histogram)
         out.mkdir(exist_ok=True)
         output_file(target, ".exr", "depth", figure=command.figure)
         found = _estimated(command, network, choose, histogram, file, target)
@@ -301,6 +304,13 @@ def _chosen_method(command: Depth, sensor: Sensor) -> Method:
         return codes_method(input_file(command.codes_file), sensor)
     name = _code_name(command) if command.method == "compressive" else command.method
     return depth_method(name, sensor, seed=command.seed)
+
+
+def _warn_of_clock(command: Depth, network: DepthModel | None, histogram: Histogram) -> None:
+    if network is not None:
+        from scene2spad.networks.end_warnings import warn_of_clock
+
+        warn_of_clock(command.model or str(command.checkpoint), network.config, histogram.sensor)
 
 
 def _network(command: Depth) -> DepthModel | None:

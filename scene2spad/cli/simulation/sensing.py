@@ -247,6 +247,8 @@ def _run_zones(command: Sense, zones: ZoneArray, progress: Progress) -> dict:
                 message = "%s: %g photons a zone, the default, and not as calibrated, since --%s is given"
                 log.warning(message, name, DEFAULT_PHOTONS, other)
         zones = with_budget(zones, transient, sensor, budget_of(command), progress=progress)
+    else:
+        log.info("signal and background: as calibrated; --signal and --background set them")
     histogram = sense_zones(transient, sensor, zones, seed=command.seed, progress=progress)
     seconds = time.perf_counter() - start
     _log_plan(histogram)

@@ -92,7 +92,8 @@ class Materials(Textures):
                     raise plugin.fail("a mask inside a mask, expected one")
                 opacity = self.fraction(plugin, "opacity", 0.5, uv)
                 if not isinstance(opacity, Texture) and 0 < opacity < 1:
-                    plugin.note(f"opacity {opacity:g} is taken as {int(opacity >= 0.5)}: no part of light passes")
+                    taken = "1: no light passes" if opacity >= 0.5 else "0: all light passes"
+                    plugin.note(f"opacity {opacity:g} is taken as {taken}")
                 plugin.note_unused()
             elif plugin.type != "twosided":
                 return plugin, opacity, twosided
