@@ -36,7 +36,14 @@ def depth_method(name: str, sensor: Sensor, *, seed: int = 0) -> Method:
         model = load_model(checkpoint_of(name))[0]
     except InputError as error:
         raise InputError(f"method {name!r} is none of {_classical_kinds()} or a network: {error}") from None
-    return lambda histogram: model.estimate(histogram).depth_m
+
+    def estimated(histogram: Histogram) -> np.ndarray:
+        from scene2spad.networks.end_warnings import warn_of_clock
+
+        warn_of_clock(name, model.config, histogram.sensor)
+        return model.estimate(histogram).depth_m
+
+    return estimated
 
 
 def is_classical(name: str) -> bool:

@@ -19,6 +19,7 @@ from scenes.errors import InputError, require, require_kind, require_kinds, requ
 from spad.estimators.depth import by_pixels
 
 LEVELS = 127  # +- steps of an 8-bit part: symmetric, -128 is left out so that a sign can always be turned
+LEAST = 1e-15  # of a part's largest value, and its inverse the most: squares of codes are summed in float32
 WHOLE = 1e-3  # of a step: float32 holds products of steps to a hundredth of that
 
 
@@ -71,6 +72,9 @@ class CodingTensor:
                 raise InputError(
                     f"coding tensor {self.name}: {label} part of shape {shape}, expected finite values {layout}"
                 )
+            largest = float(part.abs().max())
+            what = f"coding tensor {self.name}: the largest value of the {label} part is {largest:g}"
+            require(largest == 0 or LEAST <= largest <= 1 / LEAST, f"{what}, expected {LEAST:g} to {1 / LEAST:g}")
             object.__setattr__(self, label, part)
         if self.spatial is not None:
             alike = self.temporal.ndim == 2 and len(self.spatial) == len(self.temporal)
@@ -79,9 +83,11 @@ class CodingTensor:
         if self.steps is not None:
             self._check_steps(self.steps)
         size = self.bins * self.rows * self.columns
-        require(
-            self.codes <= size, f"coding tensor {self.name}: {self.codes} codes of a block of {size} counts, the limit"
+        swapped = (
+            "; codes come first, (K, T): transpose it?" if self.temporal.ndim == 2 and self.spatial is None else ""
         )
+        limit = f"{self.codes} codes of a block of {size} counts, the limit{swapped}"
+        require(self.codes <= size, f"coding tensor {self.name}: {limit}")
 
     def _check_steps(self, steps: object) -> None:
         """Make the steps a pair of numbers. Raises InputError unless both parts are whole steps within +-LEVELS."""

@@ -138,6 +138,7 @@ def open_checked(path: Path) -> Iterator[h5py.File]:
             _probe(path, contents=False)
         else:
             # ours begin with the mark, or, made by earlier versions, with HDF5's own signature
+            require(len(start) > 0, "the file is empty")
             require(start.startswith(SIGNATURE), "is no HDF5 file of ours, or the mark of its checksum is damaged")
             _probe(path, contents=True)
     with h5py.File(path, "r") as opened:

@@ -7,6 +7,7 @@ published `bin` is round(2 d / (c Delta)), with c = 3e8 m/s.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
-from scenes.errors import InputError, require, require_kind, require_whole
+from scenes.errors import InputError, listed, require, require_kind, require_whole
 from scenes.limits import require_memory
 from spad.detection.laws import LOW_FLUX
 from spad.estimators.bistatic import CO_LOCATED, laser_baseline_m, time_tells_depth
@@ -33,6 +34,8 @@ from spad.sensor.template import binned_pulse
 RATES_EPSILON = 1e-8
 NO_BIN = 1  # what MATLAB's maximum of an empty histogram answers
 PEAK_ARRIVALS = 64
+log = logging.getLogger("scene2spad")
+
 PULSE_NAME = "PSF_used_for_simulation_nr-"
 SAME_PULSE = 1e-3  # of a pulse's sum: taps that differ by less in every bin are of the same pulse
 ESTIMATES = {"argmax": "argmax", "lmf": "lmf-published", "zncc": "correlation"}
@@ -243,6 +246,11 @@ def _newer_sensor(contents: Mapping[str, Matrix], bins: int, pulse_file: Path) -
     """Return the sensor of a frame that says its bin width, with the pulse of the file beside it."""
     plain = Sensor(name="mat", bins=bins, bin_width_s=float(contents["bin_size"].item()))
     if not pulse_file.is_file():
+        others = sorted(other.name for other in pulse_file.parent.glob(f"{PULSE_NAME}*.mat"))
+        if others:
+            log.warning(
+                "%s: not there, so the reference pulse is taken; of other sizes: %s", pulse_file, listed(others)
+            )
         return plain
     taps = read_taps(pulse_file, bins)
     train = replace(plain, pulse=PRESETS["iccv2023-train"].pulse)

@@ -65,6 +65,7 @@ def load_mat(path: Path, names: Sequence[str] | None = None) -> dict[str, Matrix
     import scipy.sparse
 
     path = Path(path)
+    require(not path.is_dir(), f"{path}: is a folder, expected a file")
     require(path.is_file(), f"{path}: file not found")
     data = path.read_bytes()
     try:

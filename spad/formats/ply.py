@@ -100,7 +100,8 @@ def write_ply(
     Raises
     ------
     InputError
-        For arrays of other sizes, no point that is known, another ending, and where the file cannot be written.
+        For arrays of other sizes, values outside [0, 1], no point that is known, another ending, and where the file
+        cannot be written.
 
     Examples
     --------
@@ -124,6 +125,8 @@ def write_ply(
         fits = values.shape == known.shape and values.dtype.kind in "biuf"
         require(fits, f"{path}: {name} is {values.dtype}{values.shape}, expected numbers {known.shape}")
         columns[name] = values[known].astype("<f4")
+        low, high = float(np.nanmin(columns[name], initial=0)), float(np.nanmax(columns[name], initial=0))
+        require(low >= 0 and high <= 1 + 1e-6, f"{path}: {name} is from {low:g} to {high:g}, expected 0 to 1")
     grey = np.rint(255 * np.clip(np.nan_to_num(columns["intensity"]), 0, 1) ** (1 / 2.2)).astype(np.uint8)
     _write(columns | dict.fromkeys(("red", "green", "blue"), grey), path)
     return path

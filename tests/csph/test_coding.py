@@ -238,6 +238,19 @@ def test_wrong_shapes_are_refused() -> None:
         decode_depth(torch.full((3, 8), math.nan), coding, SMALL)
 
 
+def test_codes_that_float32_cannot_hold_are_refused() -> None:
+    """Squares of values of 1e20 end in infinity, and those of 1e-30 in 0: depth was wrong without a word."""
+    rows = truncated_fourier(8, 64)
+    for scale, fits in ((1e-14, True), (1e14, True), (1e-16, False), (1e20, False)):
+        if fits:
+            CodingTensor("mine", rows * scale)
+        else:
+            with pytest.raises(InputError, match=r"the largest value of the temporal part is .*, expected 1e-15 to 1e"):
+                CodingTensor("mine", rows * scale)
+    with pytest.raises(InputError, match=r"64 codes of a block of 8 counts, the limit; codes come first, \(K, T\)"):
+        CodingTensor("mine", np.asarray(rows).T)
+
+
 def test_read_only_arrays_are_encoded_without_a_warning():
     counts = np.ones((2, 16), np.int32)
     counts.setflags(write=False)

@@ -264,6 +264,11 @@ def test_points_lie_at_the_depth_that_is_given():
         (lambda t, h: s2s.write_ply(np.ones((2, 2)), "a.ply"), r"a.ply: points are float64\(2, 2\)"),
         (lambda t, h: s2s.write_ply(np.full((2, 3), np.nan), "a.ply"), "a.ply: none of 2 points is known"),
         (lambda t, h: s2s.write_ply(np.ones((0, 3)), "a.ply"), "a.ply: none of 0 points is known"),
+        (
+            lambda t, h: s2s.write_ply(np.ones((2, 3)), "a.ply", intensity=np.array([0, 40])),
+            "a.ply: intensity is from 0 to 40, expected 0 to 1",
+        ),
+        (lambda t, h: s2s.read_mat("."), "is a folder, expected a file"),
         (lambda t, h: s2s.write_ply(np.ones((2, 3)), "a.obj"), "a.obj: a point cloud ends in .ply"),
         (lambda t, h: s2s.write_ply(np.ones((2, 3)), "a.ply", intensity=np.ones(3)), r"intensity is float64\(3,\)"),
         (lambda t, h: s2s.write_ply(np.ones((2, 3)), 3), "write_ply: expected a path, not int"),

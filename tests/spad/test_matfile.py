@@ -300,3 +300,13 @@ def test_the_same_data_give_the_same_bytes_whenever_they_are_written(tmp_path, m
     assert data == (tmp_path / "b.mat").read_bytes()
     assert data[:19] == b"MATLAB 5.0 MAT-file" and data[124:128] == b"\x00\x01IM"
     assert (load_mat(tmp_path / "b.mat")["a"].ravel() == np.arange(3.0)).all()
+
+
+def test_a_pulse_of_another_size_is_said_not_to_be_taken(tmp_path, caplog):
+    write_mat(made(), tmp_path / "f.mat")
+    pulse = next(tmp_path.glob("PSF*"))
+    read_mat(tmp_path / "f.mat")
+    assert not caplog.records
+    pulse.rename(pulse.with_name("PSF_used_for_simulation_nr-9_nc-9.mat"))
+    read_mat(tmp_path / "f.mat")
+    assert "reference pulse is taken; of other sizes: PSF_used_for_simulation_nr-9_nc-9.mat" in caplog.text

@@ -92,7 +92,10 @@ def _write(path: Path | None, text: str) -> dict[str, str]:
 def _table(command: Ultraphase, progress: Progress) -> dict:
     rows = table(all_costs(progress))
     step = method("coarse-16-shift-2")
+    load = Load()
+    per = f"{load.photons:g} photons a frame and pixel, {load.frames_per_s:g} frames a second"
     shown: JsonObject = {
+        "load": f"{load.pixels} pixels with a core each, {per}; rates and powers are of all of them",
         "rows": rows,
         "references": {
             name: {"bytes_per_pixel": bits / 8, "readout_uw": 1e6 * power(Cost(0, 0, bits), Load()).readout_w}

@@ -11,7 +11,7 @@ from scene2spad.options.common import Common, File, GivenFile, Positional
 from scenes.errors import require
 from scenes.progress import Progress
 
-FIGURES = ("mae_mm", "rmse_mm", "median_mm", "within_10mm", "pixels", "beyond_range", "missing")
+FIGURES = ("mae_mm", "rmse_mm", "median_mm", "median_abs_mm", "within_10mm", "pixels", "beyond_range", "missing")
 TABLE = Mark("table of `compare`", lambda path: begins(path, rb"method,mae_mm,rmse_mm,"))
 
 

@@ -81,7 +81,8 @@ def run(command: Export, progress: Progress) -> dict:
     all_forms = (".npz", ".h5", ".ply")
     wanted = {"codes": CODES, "network": CODES, "depth": (".ply",), "transient": all_forms, "pack": all_forms}
     wanted["histogram"] = all_forms
-    require(kind in wanted, f"{path}: is of kind {kind}, which is not exported")
+    read = "; a table of codes goes to `depth --codes-file`" if kind == "text" else ""
+    require(kind in wanted, f"{path}: is of kind {kind}, which is not exported{read}")
     raise InputError(f"{out}: a file of kind {kind} goes to {', '.join(wanted[kind])}")
 
 
