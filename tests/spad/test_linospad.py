@@ -149,7 +149,7 @@ def bad_files(folder):
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     yield folder / "hdf5.mat", "version 7.3"
     yield folder / "missing.mat", "file not found"
-    yield folder, "file not found"
+    yield folder, "is a folder, expected a file"
 
 
 def test_bad_files_are_refused_in_one_line(tmp_path):
