@@ -6,6 +6,7 @@ Work comes in runs, numbers that one process does in a row. A run whose worker d
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import re
 from collections.abc import Generator, Iterable, Iterator
@@ -77,7 +78,8 @@ def _dask_client(address: str) -> Iterator[Client]:
         raise InputError("--scheduler needs the package `distributed`: pip install 'scene2spad[cluster]'") from None
     with _cluster_logs_off():
         try:
-            client = Client(address, timeout=CONNECT_S)
+            with _nothing_collected():
+                client = Client(address, timeout=CONNECT_S)
         except (OSError, ValueError, TypeError) as error:
             message = " ".join(str(error).split())[:120]
             raise InputError(f"scheduler {address}: cannot be reached ({message or type(error).__name__})") from None
@@ -89,6 +91,20 @@ def _dask_client(address: str) -> Iterator[Client]:
         finally:
             with suppress(TimeoutError):
                 client.close(timeout=CLOSE_S)
+
+
+@contextmanager
+def _nothing_collected() -> Iterator[None]:
+    """Keep Python from collecting garbage: an earlier client that never reached its scheduler closes itself when it is
+    collected, and waits for a lock that a client holds while it starts: for ever, in one thread."""
+    gc.collect()
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Sets whose making was stopped, or never got under way: what is left, and what is said of it."""
 
+import gc
 import json
 import math
 import os
@@ -34,6 +35,21 @@ def test_a_machine_too_busy_for_dask_is_told_so_in_one_line(tmp_path, monkeypatc
     monkeypatch.setattr(distributed, "Client", too_busy)
     with pytest.raises(InputError, match=r"scheduler tcp://x:1: cannot be reached \(Dask's event loop did not start"):
         make_set(JOB, 1, tmp_path / "set", scheduler="tcp://x:1")
+
+
+def test_no_garbage_is_collected_while_a_client_of_dask_starts(tmp_path, monkeypatch):
+    """An earlier client that is collected then waits for the lock of the one that starts: the suite stood still."""
+    distributed = pytest.importorskip("distributed")
+    collects = []
+
+    def starting(*_, **__):
+        collects.append(gc.isenabled())
+        raise OSError
+
+    monkeypatch.setattr(distributed, "Client", starting)
+    with pytest.raises(InputError, match="cannot be reached"):
+        make_set(JOB, 1, tmp_path / "set", scheduler="tcp://x:1")
+    assert collects == [False] and gc.isenabled()
 
 
 def test_a_finished_set_does_not_hide_a_scheduler_that_is_not_there(tmp_path):
