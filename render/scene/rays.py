@@ -160,7 +160,7 @@ def _crossing(cosine: Floats, solid: Floats, thin: Floats) -> Array:
 
 
 class Layers(NamedTuple):
-    """What a ray passes and what stops it, as `first_opaque` has it.
+    """Hold what a ray passes and what stops it, as `first_opaque` has it.
 
     shortening  distance by which glass shortens the geometric spreading, the sum of t (1 - 1/n): `spreading`
     medium      index of refraction before the end; 0: no face told it

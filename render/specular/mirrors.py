@@ -30,8 +30,8 @@ class Mirrors(NamedTuple):
     """Plane smooth faces n . x = c, the camera at the origin, (n,) or (n, 3) each.
 
     `low` and `high` bound the face, and so do the `corners` (n, 4, 3) of a rectangle in its plane; `shape` is its
-    mesh's registered index; `is_metal` and `is_solid` (thick glass) its material; all
-    others are glass and the coat of plastic.
+    mesh's registered index; `is_metal` and `is_solid` (thick glass) its material; what is not
+    metal is glass or the coat of plastic.
     """
 
     normal: np.ndarray

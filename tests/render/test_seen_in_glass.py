@@ -231,8 +231,8 @@ def test_a_wall_seen_in_both_faces_of_a_slab():
 
 
 def test_light_comes_and_goes_by_the_faces_of_a_slab():
-    """Of the ways there and back by one of two faces each, the mixed ones are as many: (a + b)^2 where nothing differs
-    but the energies a and b of the faces."""
+    """Compare with (a + b)^2: there and back light goes by either face, and nothing else differs but their reflectances
+    a and b."""
     camera = view(4.0)
     got, _ = sums(specular((slab(2e-3), square((3, 0, -2), (-1, 0, 0), 9, MATT)), camera=camera), 3)
     _, way, cosine = mirrored_wall(camera)
@@ -282,7 +282,7 @@ def test_a_scanning_laser_sees_the_room_by_way_of_a_window():
 
 
 def test_glass_reflects_no_more_than_it_lets_not_pass():
-    """What is seen in a pane and what is seen through it is all there is, R + T = 1: a wall, and one at its image."""
+    """Add up what is seen in a pane and what is seen through it, a wall and one at its image: R + T = 1."""
     camera = view()
     mirrored = square((3, 0, -2), (-1, 0, 0), 9, MATT)
     behind = square((0, 0, -5), (0, 0, 1), 9, MATT)  # where the image of the other wall is
