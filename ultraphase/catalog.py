@@ -125,7 +125,12 @@ class Method:
             constants["SHIFT"] = (timestamps // self.codes).bit_length() - 1
             if self.shift_step is not None:
                 constants["STEP"] = self.shift_step
-        program = assemble_file(FOLDER / f"{self.family}.s", constants, chip, name=self.name)
+        try:
+            program = assemble_file(FOLDER / f"{self.family}.s", constants, chip, name=self.name)
+        except InputError as error:
+            if str(error).startswith(f"program {self.name}: "):
+                raise
+            raise InputError(f"program {self.name}: {self.codes} codes do not fit the core ({error})") from None
         return replace(program, timestamps=(SPADS if self.family == "addressed" else 1) * timestamps)
 
     def tables(self, temporal: np.ndarray | None = None, weights: np.ndarray | None = None) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from render.transient import Transient
 from scenes.errors import InputError
 from scenes.io.versions import installed_versions
 from scenes.json_types import JsonObject
+from scenes.limits import require_memory
 from scenes.progress import Progress
 from spad.detection.detectors import LAWS
 from spad.detection.exposure import Exposure, counts_of, timestamps_of
@@ -26,6 +27,7 @@ from spad.sensor.model import PhotonBudget, Sensor
 Model = Literal["auto", "poisson", "first-photon", "free-running"]
 MODELS: tuple[str, ...] = ("auto", *LAWS)
 _HASHES: WeakKeyDictionary[Transient, str] = WeakKeyDictionary()
+BYTES_PER_STAMP = 4  # two each, in parts and joined
 IDLE = "the dead time of {:g} s has no effect, as the detector is armed at every cycle"
 
 
@@ -81,8 +83,13 @@ def sense_timestamps(
     progress: Progress | None = None,
 ) -> Timestamps:
     """Return the same exposure as `sense`, detection for detection, as timestamps: no histogram where photons are
-    few."""
+    few.
+
+    Raises InputError where so many detections are expected that their timestamps would not fit into memory.
+    """
     exposure, truth = _planned(transient, sensor, budget, seed, model, dark_map_hz)
+    expected = sum(float(truth[name].sum(dtype=np.float64)) for name in ("expected_signal", "expected_background"))
+    require_memory(BYTES_PER_STAMP * expected, f"{expected:.3g} timestamps")
     return timestamps_of(exposure, truth["meta"], progress)
 
 

@@ -76,6 +76,14 @@ class Paint:
             raise InputError(f"{self.path}: broken colours of {part.name} ({reason})") from None
         return self.made[key]
 
+    def coordinates(self, part: Part) -> np.ndarray | None:
+        """Return the texture coordinates of a part, scaled and shifted as an OBJ's material says: uv * s + o."""
+        source = getattr(part.visual, "material", None)
+        if part.uv is None or source is None or self.path.suffix.lower() != ".obj":
+            return part.uv
+        entry = self.library.get(str(source.name), MaterialEntry())
+        return part.uv * np.array(entry.uv_scale) + np.array(entry.uv_shift)
+
     def _albedo(self, part: Part) -> Albedo:
         """Return a key that tells the part's albedo from others, and a function that makes the albedo."""
         source = getattr(part.visual, "material", None)

@@ -331,4 +331,5 @@ def _sound(part: Part, notes: list[str]) -> Part | None:
 
 
 def _surface(part: Part, paint: Paint) -> Surface:
-    return Surface(part.vertices, part.faces, paint.material(part), uv=part.uv, normals=part.normals, name=part.name)
+    uv = paint.coordinates(part)
+    return Surface(part.vertices, part.faces, paint.material(part), uv=uv, normals=part.normals, name=part.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from scenes.io.inputs import file_inside, read_bytes
 from scenes.io.textures import WHITE, Colour
 
 # Options of a map, and what they are where they change nothing: up to three numbers, of which those left out are as
-# stated here, or as many words; None is one word that matters to a cache or to other maps alone.
+# stated here, or as many words; None is one word that matters to a cache or to other maps alone. -s and -o are read.
 POINT_OPTIONS = {"-s": (1.0, 1.0, 1.0), "-o": (0.0, 0.0, 0.0), "-t": (0.0, 0.0, 0.0)}
 WORD_OPTIONS = {
     "-blendu": ("on",),
@@ -35,10 +36,13 @@ _LOOKS = {
 
 @dataclass(frozen=True)
 class MaterialEntry:
-    """Entry of an .mtl file for one material: linear RGB of Kd, file of map_Kd, whether it names a map_d, d."""
+    """Entry of an .mtl file for one material: linear RGB of Kd, file of map_Kd with the scale (-s) and the shift (-o)
+    of its texture coordinates (2,), whether it names a map_d, d."""
 
     colour: Colour | None = None
     image: Path | None = None
+    uv_scale: tuple[float, float] = (1.0, 1.0)
+    uv_shift: tuple[float, float] = (0.0, 0.0)
     cut_out: bool = False
     opacity: float = 1.0
 
@@ -73,7 +77,7 @@ def lenient_text(path: Path) -> str:
 def read_library(library: Path, notes: list[str]) -> dict[str, MaterialEntry]:
     """Read a material library: its materials by name, with notes on options of images that are left out.
 
-    Raises InputError for an image that is not there, and for options that move an image on its surface.
+    Raises InputError for an image that is not there, and for one that is distorted at random (-t).
     """
     entries: dict[str, MaterialEntry] = {}
     changed: dict[str, list[str]] = {}  # materials by what is changed
@@ -92,7 +96,7 @@ def read_library(library: Path, notes: list[str]) -> dict[str, MaterialEntry]:
         elif key.lower() in _LOOKS and name and _is_some(rest):
             changed.setdefault(f"{key} is left out, {_LOOKS[key.lower()]}", []).append(name)
         elif key.lower() == "map_kd" and name:
-            entries[name] = replace(entries[name], image=_map_kd(library, name, rest, notes))
+            entries[name] = _with_map(entries[name], library, name, rest, notes)
         elif key.lower() == "map_d" and name:
             entries[name] = replace(entries[name], cut_out=True)
         elif key.lower() in ("d", "tr") and name and not (key.lower() == "tr" and name in stated):
@@ -132,9 +136,10 @@ def _kd(library: Path, text: str) -> tuple[Colour, Colour]:
     return (red, green, blue), (clipped[0], clipped[1], clipped[2])
 
 
-def _map_kd(library: Path, name: str, text: str, notes: list[str]) -> Path:
-    """Return the texture file of a map_Kd line; options that would move or distort it are refused, others noted."""
+def _with_map(entry: MaterialEntry, library: Path, name: str, text: str, notes: list[str]) -> MaterialEntry:
+    """Return the entry with what a map_Kd line says: its file, -s and -o. Other options are noted, -t is refused."""
     where = f"{library}: map_Kd of material {name}"
+    points: dict[str, tuple[float, ...]] = dict(POINT_OPTIONS)
     rest = text.strip()
     while rest.startswith("-") and len(rest.split(maxsplit=1)) == 2:
         option, rest = rest.split(maxsplit=1)
@@ -142,9 +147,11 @@ def _map_kd(library: Path, name: str, text: str, notes: list[str]) -> Path:
         if option in POINT_OPTIONS:
             identity = POINT_OPTIONS[option]
             values, rest = _leading_numbers(rest)
-            same = (*values, *identity[len(values) :]) == identity
+            points[option] = (*values, *identity[len(values) :])
+            same = option != "-t" or points[option] == identity
             shown = " ".join(f"{value:g}" for value in values)
-            require(same, f"{where}: option {option} {shown} is not read; write it into the texture coordinates")
+            require(same, f"{where}: option {option} {shown} is not read; bake it into the image")
+            require(all(map(math.isfinite, values)), f"{where}: option {option} {shown}, expected finite numbers")
         elif option in WORD_OPTIONS:
             usual = WORD_OPTIONS[option]
             words = rest.split(maxsplit=1 if usual is None else len(usual))
@@ -155,9 +162,11 @@ def _map_kd(library: Path, name: str, text: str, notes: list[str]) -> Path:
             notes.append(f"material {name}: option {option} of map_Kd is left out")
             rest = _named_file(library.parent, rest)
     try:
-        return file_inside(library.parent, rest, f"texture of material {name}")
+        image = file_inside(library.parent, rest, f"texture of material {name}")
     except InputError as error:
         raise InputError(f"{library}: {error}") from None
+    (*scale, _), (*shift, _) = points["-s"], points["-o"]
+    return replace(entry, image=image, uv_scale=(scale[0], scale[1]), uv_shift=(shift[0], shift[1]))
 
 
 def _named_file(folder: Path, text: str) -> str:
