@@ -35,7 +35,7 @@ def test_rate_0_everywhere(model: str, tmp_path) -> None:
 
 def test_more_timestamps_than_memory_holds_are_refused(monkeypatch) -> None:
     monkeypatch.setenv("SCENE2SPAD_MEMORY_GB", "0.001")
-    with pytest.raises(InputError, match="6e\\+06 timestamps: needs 0.024 GB of memory, the limit is 0.001 GB"):
+    with pytest.raises(InputError, match=r"6e\+06 timestamps: needs 0.024 GB of memory, the limit is 0.001 GB"):
         sense_timestamps(same(6, (4.0, 4.0, 1.0)), REFERENCE, PhotonBudget(5e5, 5e5))
 
 
