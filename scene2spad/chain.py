@@ -233,7 +233,9 @@ def estimate_depth(histogram: Histogram, method: str | Path | CodingTensor | Dep
 
     if isinstance(method, CodingTensor):
         return decoded_by(method)(histogram)
-    require(hasattr(method, "estimate"), f"depth method {method!r}: expected a name, a file, codes or a network")
+    given = type(method).__name__
+    known = "a name, a file, codes (`CodingTensor`) or a network"
+    require(hasattr(method, "estimate"), f"depth method of type {given}: expected {known}")
     return method.estimate(histogram).depth_m
 
 

@@ -78,7 +78,7 @@ def truncated_fourier(codes: int, bins: int, rows: Rows = "centred") -> Tensor:
 
     `rows` = "published": cos(2 pi f i / T), and -sin. No harmonic 0, so that rows sum to zero and a uniform background
     leaves no trace; none from T/2 on, where the sine or the cosine vanishes. Raises InputError unless K is even and
-    2 <= K <= T - 2.
+    2 <= K < T.
 
     Examples
     --------
@@ -115,7 +115,7 @@ def gray_frequencies(pulse: Tensor) -> list[int]:
     of two come first, then the others, ascending (Gutierrez-Barragan et al., CVPR 2022, as published for ICCV 2023).
     """
     spectrum = torch.fft.rfft(pulse.double()).abs()
-    inside = spectrum[1 : (len(pulse) + 1) // 2] >= BAND_LIMIT * spectrum[1]
+    inside = spectrum[1 : (len(pulse) + 1) // 2] >= BAND_LIMIT * spectrum[1:2]  # of one bin both are empty
     usable = [f for f, kept in enumerate(inside.tolist(), start=1) if kept]
     return sorted(usable, key=lambda f: (f & (f - 1) != 0, f))
 
@@ -126,6 +126,7 @@ def gray_fourier(codes: int, bins: int, pulse: Tensor, rows: Rows = "centred") -
     Raises InputError where there are fewer.
     """
     frequencies = gray_frequencies(pulse)
+    require(len(frequencies) > 0, f"Gray Fourier: {bins} bins hold no harmonic, expected 3 bins or more")
     if codes % 2 or not 2 <= codes <= 2 * len(frequencies):
         raise InputError(
             f"Gray Fourier: {codes} codes, expected an even number from 2 to {2 * len(frequencies)}: the pulse's band "

@@ -29,10 +29,12 @@ def waves(harmonics: Sequence[int] | np.ndarray, bins: int, rows: Rows = "centre
 def truncated_waves(codes: int, bins: int, rows: Rows = "centred") -> np.ndarray:
     """Return the K rows of harmonics 1 .. K/2, (K, Mt) float32; see `csph.codes.temporal.truncated_fourier`.
 
-    Raises InputError unless K is even and 2 <= K <= Mt - 2.
+    Raises InputError unless K is even and 2 <= K < Mt.
     """
+    most = (bins - 1) // 2 * 2
+    require(most >= 2, f"truncated Fourier: {bins} bins hold no harmonic, expected 3 bins or more")
     require(
-        codes % 2 == 0 and 2 <= codes <= bins - 2,
-        f"truncated Fourier: {codes} codes, expected an even number from 2 to {bins - 2} for {bins} bins",
+        codes % 2 == 0 and 2 <= codes <= most,
+        f"truncated Fourier: {codes} codes, expected an even number from 2 to {most} for {bins} bins",
     )
     return waves(np.arange(1, codes // 2 + 1), bins, rows)

@@ -62,12 +62,19 @@ def dense_content(path: Path) -> Content:
     if np.isfinite(depth_m).any():
         layers.append(depth_layer("true depth", depth_m))
     layers += [_map(path, name, arrays[name], depth_m.shape) for name in MAPS if name in arrays]
-    step_s = float(time_s[1] - time_s[0])
+    step_s = _step_s(arrays)
     cube = Cube("detections" if counted else "light", f"{unit} per bin", np.ascontiguousarray(data),
                 1e9 * (float(time_s[0]) - step_s / 2), 1e9 * step_s, "bars" if counted else "line")  # fmt: skip
     facts = {"kind": "dense array", "pixels": f"{depth_m.shape[0]} rows x {depth_m.shape[1]} columns"}
     facts["bins"] = f"{len(time_s)} of {1e12 * step_s:.4g} ps"
     return Content(path.name, facts, tuple(layers), (cube,))
+
+
+def _step_s(arrays: dict[str, np.ndarray]) -> float:
+    """Return the width of a time bin [s]. The only bin of a sensor begins with the laser's emission, so that its centre
+    is half its width."""
+    time_s = arrays["tofs"]
+    return float(time_s[1] - time_s[0] if len(time_s) > 1 else 2 * time_s[0])
 
 
 def dense_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -79,7 +86,7 @@ def dense_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     missing = [name for name in DENSE if name not in arrays]
     require(not missing, f"{path}: no dense array that `export` wrote: holds no {', '.join(missing)}")
     data, time_s, depth_m = arrays["data"], arrays["tofs"], arrays["depth_m"]
-    shaped = data.ndim == 3 and depth_m.ndim == 2 and time_s.ndim == 1 and len(time_s) > 1
+    shaped = data.ndim == 3 and depth_m.ndim == 2 and time_s.ndim == 1 and len(time_s) > 0
     if shaped and text.get("axes") == AXES["thw"]:
         data = np.moveaxis(data, 0, 2)
     require(shaped, f"{path}: data {data.shape}, tofs {time_s.shape} and depth_m {depth_m.shape} are no dense export")
@@ -88,6 +95,7 @@ def dense_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     fits = data.shape == (*depth_m.shape, len(time_s))
     require(fits, f"{path}: data of shape {data.shape} for {depth_m.shape} pixels and {len(time_s)} times")
     known = bool(np.isfinite(data).all()) and bool(np.isfinite(time_s).all()) and bool((np.diff(time_s) > 0).all())
+    known = known and (len(time_s) > 1 or time_s[0] > 0)
     require(
         known and float(data.min(initial=0)) >= 0, f"{path}: holds negative or infinite numbers, or times that fall"
     )

@@ -86,7 +86,7 @@ def write_ply(
     Parameters
     ----------
     points : numpy.ndarray
-        Points (..., 3) [m], as `points` gives them; those that are NaN are left out.
+        Points (..., 3) [m], as `points` gives them; those that are NaN or masked are left out.
     path : Path
         The file (.ply).
     intensity, confidence : numpy.ndarray, optional
@@ -113,11 +113,14 @@ def write_ply(
     'cloud.ply'
     """
     require(isinstance(path, str | os.PathLike), f"write_ply: expected a path, not {type(path).__name__}")
+    masked = np.ma.getmaskarray(points) if isinstance(points, np.ma.MaskedArray) else None
     path, points = Path(path), np.asarray(points)
     require(path.suffix.lower() == ".ply", f"{path}: a point cloud ends in .ply")
     shaped = points.ndim >= 1 and points.shape[-1] == 3 and points.dtype.kind in "iuf"
     require(shaped, f"{path}: points are {points.dtype}{points.shape}, expected numbers (..., 3)")
     known = np.isfinite(points).all(axis=-1)
+    if masked is not None:
+        known &= ~masked.any(axis=-1)
     require(bool(known.any()), f"{path}: none of {known.size} points is known, a cloud of none is not written")
     columns = {axis: points[known][:, i].astype("<f4") for i, axis in enumerate("xyz")}
     for name, given in (("intensity", intensity), ("confidence", confidence)):

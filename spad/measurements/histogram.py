@@ -58,8 +58,8 @@ class Histogram:
     expected_signal, expected_background   (H, W) float32, detections per pixel and exposure
     meta                 seed, plan, what made the transient: anything JSON holds
 
-    Truth in numbers of another type is converted. Raises InputError for fields of another kind, counts and masks of
-    another type, other shapes, and values below 0.
+    Truth in numbers of another type is converted, and NaN where it is masked. Raises InputError for fields of another
+    kind, counts and masks of another type, masked ones, other shapes, and values below 0.
 
     Examples
     --------
@@ -88,6 +88,7 @@ class Histogram:
         if self.counts.ndim != 3 or self.counts.dtype != np.int32 or self.counts.shape[2] != self.sensor.bins:
             shape = f"{self.counts.dtype}{self.counts.shape}"
             raise InputError(f"histogram: counts are {shape}, expected int32 (H, W, {self.sensor.bins})")
+        _require_unmasked(self.counts, "counts")
         if self.counts.size and self.counts.min() < 0:
             raise InputError(f"histogram: a bin holds {self.counts.min()} counts")
         for name in TRUTH:
@@ -101,8 +102,13 @@ class Histogram:
         # numbers to less precise ones, but no number to a truth value: ~ of the 0s and 1s of a mask is true everywhere
         fits = np.can_cast(array.dtype, kind, "same_kind")
         require(fits, f"histogram: {name} is {array.dtype}, expected {kind}")
+        if kind == np.bool_:
+            _require_unmasked(array, name)
         with np.errstate(over="ignore"):  # to infinity, which is refused
-            held = array.astype(kind, copy=False).view()
+            held = array.astype(kind, copy=False)
+        if isinstance(held, np.ma.MaskedArray):  # files hold no masks
+            held = held.filled(np.nan)
+        held = held.view()
         if (np.isinf(held) | (held < 0)).any():
             raise InputError(f"histogram: {name} holds infinite or negative values")
         held.setflags(write=False)
@@ -239,9 +245,13 @@ class Histogram:
         return sha.hexdigest()
 
 
+def _require_unmasked(array: np.ndarray, name: str) -> None:
+    require(not np.ma.is_masked(array), f"histogram: {name} are masked, fill them first: `{name}.filled(0)`")
+
+
 def _checked_counts(counts: np.ndarray, bins: int) -> np.ndarray:
     """Return counts of so many bins as an array; InputError for what `Histogram.from_counts` says."""
-    require(not np.ma.is_masked(counts), "histogram: counts are masked, fill them first: `counts.filled(0)`")
+    _require_unmasked(counts, "counts")
     try:
         array = np.asarray(counts)
     except (ValueError, RuntimeError) as error:  # rows of several lengths, tensors that are being trained

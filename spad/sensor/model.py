@@ -290,8 +290,9 @@ def detector_maps(
 def check_dark_map(measured_hz: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return a measured map's dark counts per second (H, W), 0 in dead pixels, and which are dead (NaN).
 
-    Raises InputError for another shape, and for rates below 0 or above `MAX_RATE_HZ`.
+    Raises InputError for another shape, masked rates, and rates below 0 or above `MAX_RATE_HZ`.
     """
+    require(not np.ma.is_masked(measured_hz), "dark count map is masked, fill it first: NaN stands for a dead pixel")
     measured = np.asarray(measured_hz, dtype=np.float64)
     if measured.shape != shape:
         raise InputError(f"dark count map is {measured.shape}, the image {shape}")

@@ -64,6 +64,20 @@ def test_fourier_refuses_other_numbers_of_codes(codes: int) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_an_odd_number_of_bins_holds_all_harmonics_below_half_of_it() -> None:
+    rows = truncated_fourier(6, 7).double()
+    assert (rows @ rows.T / 3.5 - torch.eye(6)).abs().max() < 1e-6 and rows.sum(dim=-1).abs().max() < 1e-6
+    with pytest.raises(InputError, match="8 codes, expected an even number from 2 to 6 for 7 bins"):
+        truncated_fourier(8, 7)
+
+
+@pytest.mark.parametrize("bins", [1, 2])
+@pytest.mark.parametrize("name", ["fourier", "gray", "fourier-published"])
+def test_one_or_two_bins_hold_no_harmonic(name: str, bins: int) -> None:
+    with pytest.raises(InputError, match=f"Fourier: {bins} bins hold no harmonic, expected 3 bins or more"):
+        temporal_code(name, 2, bins, Sensor(bins=bins))
+
+
 def test_more_random_codes_than_bins_are_refused_before_they_are_drawn() -> None:
     with pytest.raises(InputError, match="random code: 900000000 codes, the limit is one a bin, 1024"):
         temporal_code("random", 900_000_000, 1024, REFERENCE)

@@ -233,6 +233,9 @@ def test_points_lie_at_the_depth_that_is_given():
     read = trimesh.load("cloud.ply").vertices
     known = np.isfinite(depth_m)
     assert not known[0, 0] and read == pytest.approx(found[known], rel=1e-6)
+    near = np.ma.masked_where(np.broadcast_to(~(depth_m < 4)[..., None], found.shape), found)
+    s2s.write_ply(near, "near.ply")
+    assert trimesh.load("near.ply").vertices == pytest.approx(found[depth_m < 4], rel=1e-6)
     assert main(["show", "cloud.ply", "--out", "cloud.html"]) == 0
     assert s2s.points(s2s.read_histogram("zones.h5")).shape[2] == 3
 
@@ -263,6 +266,8 @@ def test_points_lie_at_the_depth_that_is_given():
         (lambda t, h: s2s.points(s2s.Histogram.from_counts(h.counts, SENSOR)), "points: does not say which camera"),
         (lambda t, h: s2s.write_ply(np.ones((2, 2)), "a.ply"), r"a.ply: points are float64\(2, 2\)"),
         (lambda t, h: s2s.write_ply(np.full((2, 3), np.nan), "a.ply"), "a.ply: none of 2 points is known"),
+        (lambda t, h: s2s.write_ply(np.ma.masked_all((2, 3)), "a.ply"), "a.ply: none of 2 points is known"),
+        (lambda t, h: s2s.estimate_depth(h, np.ones((8, 1024))), "depth method of type ndarray: expected a name"),
         (lambda t, h: s2s.write_ply(np.ones((0, 3)), "a.ply"), "a.ply: none of 0 points is known"),
         (
             lambda t, h: s2s.write_ply(np.ones((2, 3)), "a.ply", intensity=np.array([0, 40])),

@@ -15,10 +15,12 @@ from scene2spad.cli import main
 from scene2spad.cli.results.show import page_of
 from scene2spad.viewer.exports import cloud_content, dense_content
 from scenes.errors import InputError
+from spad.formats.dense import dense, write_dense
 from spad.formats.linospad import capture_of, write_linospad
 from spad.formats.mat import read_mat
-from spad.measurements.histogram import read_histogram
+from spad.measurements.histogram import Histogram, read_histogram
 from spad.measurements.timestamps import Timestamps
+from spad.sensor.model import Sensor
 
 MODEL = "fourier-1024x1x1-128x-s0"
 EXPORTS = ("counts.npz", "counts.h5", "counts-thw.h5", "light.npz", "cloud.ply")
@@ -167,6 +169,18 @@ def test_a_cloud_page_holds_the_points():
     content, depth_m = cloud_content(Path("cloud.ply")), read_histogram(Path("gallery.h5")).depth_m
     assert np.linalg.norm(content.points, axis=1) == pytest.approx(depth_m[np.isfinite(depth_m)], rel=1e-6)
     assert content.point_value.min() >= 0 and content.point_value.max() <= 1
+
+
+@pytest.mark.parametrize("layout", ["hwt", "thw"])
+def test_an_export_of_a_single_bin_is_shown_and_inspected(layout, tmp_path, capfd):
+    sensor = Sensor(bins=1, bin_width_s=2e-9)
+    counts = np.arange(12).reshape(3, 4, 1)
+    path = write_dense(dense(Histogram.from_counts(counts, sensor)), tmp_path / "one.npz", layout=layout)
+    (cube,) = dense_content(path).cubes
+    assert (cube.start_ns, cube.step_ns) == pytest.approx((0, 2)) and np.array_equal(cube.values, counts)
+    assert main(["show", str(path), "--out", str(tmp_path / "page.html")]) == 0
+    assert main(["inspect", str(path), "--pixel", "2", "1", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out.splitlines()[-1])["pixel"]["sum"] == 9
 
 
 def test_files_of_others_are_refused_in_one_line(tmp_path, capfd):

@@ -1,5 +1,7 @@
 """Counts and event lists of one's own: what is not them is refused in one line, what is not known stays unknown."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from scenes.errors import InputError
 from spad.estimators.depth import histogram_depth_m
 from spad.formats.mat import read_mat, write_mat
 from spad.measurements.histogram import Histogram, read_histogram, write_histogram
-from spad.sensor.model import Sensor
+from spad.sensor.model import Sensor, check_dark_map
 from spad.sensor.pulse import Pulse
 
 SENSOR = Sensor(name="mine", bins=64, bin_width_s=1e-10, pulse=Pulse(1e-10))
@@ -81,6 +83,22 @@ def test_an_unknown_split_stays_unknown_in_the_published_layout(tmp_path):
     assert (read.counts == COUNTS).all() and read.budget == own.budget and not read.signal_known
     assert np.isnan(read.expected_signal).all() and np.isnan(read.expected_background).all()
     assert "how many are signal is unknown" in repr(read)
+
+
+def test_masked_truth_is_unknown_and_masked_counts_are_refused(tmp_path):
+    histogram = Histogram.from_counts(COUNTS, SENSOR)
+    masked = np.ma.array(np.full((3, 4), 2.0), mask=np.eye(3, 4, dtype=bool))
+    known = replace(histogram, depth_m=masked, mixed=np.ma.array(histogram.mixed))
+    write_histogram(known, tmp_path / "known.h5")
+    for depth_m in (known.depth_m, read_histogram(tmp_path / "known.h5").depth_m):
+        assert not isinstance(depth_m, np.ma.MaskedArray)
+        assert np.array_equal(depth_m, masked.filled(np.nan), equal_nan=True)
+    for name in ("counts", "mixed"):
+        given = np.ma.array(getattr(histogram, name), mask=True)
+        with pytest.raises(InputError, match=f"histogram: {name} are masked, fill them first"):
+            replace(histogram, **{name: given})
+    with pytest.raises(InputError, match="dark count map is masked, fill it first"):
+        check_dark_map(masked, (3, 4))
 
 
 def test_a_list_of_detections_is_the_histogram_that_it_came_from():
