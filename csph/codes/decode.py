@@ -21,6 +21,7 @@ from spad.sensor.template import FINE_STEP, pulse_taps
 log = logging.getLogger("csph")
 
 _TOLD: WeakSet[CodingTensor] = WeakSet()  # whose rank was warned of
+SEEN, SEEN_BEST = 0.1, 0.9  # of the largest |P C h|
 _TIE = 1e-6  # of the largest score: what float32 sums cannot tell apart
 
 
@@ -79,14 +80,20 @@ def _templates(coding: CodingTensor, sensor: Sensor, device: str) -> Tensor:
     over K for a coarse histogram. The mean over K is not removed where C 1 = 0: it would carry depth there, and of
     K = 2 codes only a sign would be left.
     """
+    templates = _coded_pulses(coding, sensor, device)
+    return templates / templates.norm(dim=-1, keepdim=True).clamp(min=1e-30)
+
+
+def _coded_pulses(coding: CodingTensor, sensor: Sensor, device: str) -> Tensor:
+    """Compute P C h(tau) of `_templates`, not normalised."""
     taps = pulse_taps(sensor, device)
     matrix = _matrix(coding, device)
     first = int(taps.shifts[0])
-    templates = torch.stack([correlate(matrix, step.unsqueeze(0), first, sensor).T for step in taps.fine], dim=1)
+    pulses = torch.stack([correlate(matrix, step.unsqueeze(0), first, sensor).T for step in taps.fine], dim=1)
     uniform = _background(matrix)
     if uniform.any():
-        templates = templates - (templates @ uniform).unsqueeze(-1) * uniform / (uniform @ uniform)
-    return templates / templates.norm(dim=-1, keepdim=True).clamp(min=1e-30)
+        pulses = pulses - (pulses @ uniform).unsqueeze(-1) * uniform / (uniform @ uniform)
+    return pulses
 
 
 def _first_peak(scores: Tensor, circular: bool) -> Tensor:
@@ -120,7 +127,19 @@ def _raw_depth(codes: Tensor, coding: CodingTensor, sensor: Sensor) -> Tensor:
 
 @lru_cache(maxsize=32)
 def _bias_m(coding: CodingTensor, sensor: Sensor) -> float:
-    return noise_free_bias_m(lambda counts: _raw_depth(encode(counts, coding), coding, sensor), sensor)
+    place = _seen_bin(coding, sensor)
+    return noise_free_bias_m(lambda counts: _raw_depth(encode(counts, coding), coding, sensor), sensor, place)
+
+
+def _seen_bin(coding: CodingTensor, sensor: Sensor) -> int:
+    """Return the middle bin, or where codes hardly see a pulse there, as those of a gate beside it, the middle one of
+    the bins that they see best."""
+    pulses = _coded_pulses(coding, sensor, "cpu")
+    seen, middle = pulses[:, pulses.shape[1] // 2].norm(dim=-1), coding.bins // 2
+    if seen[middle] >= SEEN * seen.max():
+        return middle
+    best = torch.nonzero(seen >= SEEN_BEST * seen.max()).flatten()
+    return int(best[len(best) // 2])
 
 
 def decode_depth(codes: Tensor | np.ndarray, coding: CodingTensor, sensor: Sensor) -> Tensor:

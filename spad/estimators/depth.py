@@ -119,18 +119,20 @@ def _raw_depth(rows: Tensor, sensor: Sensor, method: str) -> Tensor:
     return by_pixels(one, rows, pulse_taps(sensor, str(rows.device)).fine.numel()) * sensor.bin_depth_m
 
 
-def noise_free_bias_m(estimator: str | Callable[[Tensor], Tensor], sensor: Sensor) -> float:
+def noise_free_bias_m(
+    estimator: str | Callable[[Tensor], Tensor], sensor: Sensor, time_bin: int | None = None
+) -> float:
     """Return mean over sub-bin phases of estimate - truth [m] for the expected counts of a lone pulse without
     background.
 
     `estimator` is one of METHODS, before the subtraction (computed once a sensor), or any function of counts (P, T)
-    that gives depth (P,) in metres.
+    that gives depth (P,) in metres. The function's pulse arrives in `time_bin`, the middle one if it is left out.
     """
     if isinstance(estimator, str):
         _require_method(estimator)
         return _method_bias_m(estimator, sensor)
     phases = (torch.arange(_BIAS_PHASES, dtype=torch.float64) + 0.5) / _BIAS_PHASES
-    arrival = (sensor.bins // 2 + phases) * sensor.bin_width_s
+    arrival = ((sensor.bins // 2 if time_bin is None else time_bin) + phases) * sensor.bin_width_s
     error = estimator(_BIAS_SIGNAL * binned_pulse(arrival, sensor)).double() - arrival * SPEED_OF_LIGHT_M_PER_S / 2
     half = sensor.range_m / 2
     return float((torch.remainder(error + half, sensor.range_m) - half).mean())

@@ -334,3 +334,14 @@ def test_arrays_of_the_other_byte_order_are_taken(kind: str) -> None:
     counts = np.eye(64, dtype=kind)
     assert torch.equal(encode(counts, coding), coding.temporal.T)
     assert decode_depth(encode(counts, coding).numpy().astype(">f4"), coding, SMALL).isfinite().all()
+
+
+def test_codes_of_a_gate_beside_the_middle_of_the_record_find_depth_without_a_bias() -> None:
+    gate, rows = slice(100, 500), torch.zeros(8, 1024)
+    rows[:, gate] = truncated_fourier(8, 400)
+    gated, arrival = CodingTensor("gated", rows), (150 + 20.3 * torch.arange(16, dtype=torch.float64)) * 1e-7 / 1024
+    depth = decode_depth(encode(1e4 * binned_pulse(arrival, REFERENCE), gated), gated, REFERENCE)
+    # As Fourier codes of the whole record, of which a bin is 14.6 mm; the gate's middle had been missed by 59 mm.
+    assert wrapped_error(depth, arrival, REFERENCE).abs().max() < 2e-4
+    few = CodingTensor("few", 3 * torch.eye(8, 64))
+    assert decode_depth(torch.eye(8)[2:6], few, SMALL).isfinite().all()
