@@ -22,7 +22,7 @@ from render.settings import (
     RenderSettings,
 )
 from scenes.errors import InputError
-from scenes.model import Material
+from scenes.model import LaserMode, Material
 
 DEFAULT_ERROR = 0.02
 # Of the square that is aimed at: the rest is for merged returns and what twice as many rays a side still miss.
@@ -125,6 +125,20 @@ def refracting(world: TracedScene, settings: RenderSettings) -> TracedScene:
     return world.refracting(bool(world.solid_indices) and at_camera and settings.refraction != "straight")
 
 
+def _check_laser(mode: LaserMode, settings: RenderSettings) -> None:
+    """Raise InputError for settings of indirect light that mean nothing under a laser of this mode."""
+    if settings.filter and mode != "flood":
+        raise InputError(
+            f"render: a filter shares light of a flood laser among pixels, this one is {mode}: leave it out"
+        )
+    for name in ("spp", "clamp"):
+        value = getattr(settings, name)
+        if mode == "scan" and settings.bounces is None and value is not None:
+            raise InputError(
+                f"render: {name} {value:g} is for indirect light, which a scanning laser has only with bounces above 1"
+            )
+
+
 def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     """Plan a render: every choice that `settings` leaves open follows from a pilot; every choice gets a reason.
 
@@ -133,11 +147,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     pixels = pilot_pixels(world, seed)
     reasons = list(_limits(world))
     mode_is_flood = world.scene.laser.mode == "flood"
-    if settings.filter and not mode_is_flood:
-        mode = world.scene.laser.mode
-        raise InputError(
-            f"render: a filter shares light of a flood laser among pixels, this one is {mode}: leave it out"
-        )
+    _check_laser(world.scene.laser.mode, settings)
     direct_alone = settings.bounces == 1 or (settings.bounces is None and world.scene.laser.mode == "scan")
     fine = None
     if settings.grid is None or settings.budget is not None or not direct_alone:

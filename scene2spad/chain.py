@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from numbers import Integral, Real
+from numbers import Integral
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Literal
@@ -82,12 +82,13 @@ def render(
 
     _check_progress(progress)
     _check_settings(settings, [field.name for field in fields(RenderSettings)])
+    chosen = RenderSettings(**settings)
     if not isinstance(scene, Scene):
         scene = _loaded(str(scene), seed, width, height, placing)
     elif width is not None or height is not None or placing is not None:
         raise InputError("render: a Scene has its own camera; width, height and placing go with a name or a file")
     with _RENDERING:
-        return render_scene(scene, RenderSettings(**settings), seed=seed, progress=progress)
+        return render_scene(scene, chosen, seed=seed, progress=progress)
 
 
 def _loaded(name: str, seed: int, width: int | None, height: int | None, placing: Placing | None) -> Scene:
@@ -110,14 +111,12 @@ PLACING |= {field: field for field in PLACING.values()}
 
 
 def _check_settings(settings: dict[str, Any], known: list[str]) -> None:
-    """Raise InputError for unknown settings, and for those that are no numbers and have to be."""
+    """Raise InputError for unknown settings."""
     for name, value in settings.items():
         if name in PLACING:
             field = PLACING[name]
             raise InputError(f"render: {name!r} is no setting, give placing=scene2spad.Placing({field}={value!r})")
         require(name in known, f"render: setting {name!r} is unknown{did_you_mean(name, known)}")
-        if value is not None and name not in ("refraction", "budget"):
-            require(isinstance(value, Real | np.bool_), f"render: {name} {value!r}, expected a number")
 
 
 def sense(

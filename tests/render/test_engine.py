@@ -107,6 +107,14 @@ def test_plan_gives_a_reason_for_every_choice_and_can_be_forced():
     assert fine["spp"] > 4 * coarse["spp"], "more photons show more of the render's error"
 
 
+@pytest.mark.parametrize(("name", "value"), [("spp", 64), ("clamp", 3)])
+def test_settings_of_indirect_light_are_refused_where_a_scanning_laser_has_none(name, value):
+    with pytest.raises(InputError, match=f"{name} {value} is for indirect light.*scanning laser"):
+        render(room("scan"), RenderSettings(**{name: value}))
+    asked = render(room("scan"), RenderSettings(bounces=2, grid=2, **{name: value}))
+    assert asked.indirect_fraction > 0
+
+
 def test_ambient_light_is_rendered_only_where_a_budget_has_room_for_it():
     dark = room()
     lit = replace(dark, surfaces=(replace(dark.surfaces[0], emission=0.3), dark.surfaces[1]))

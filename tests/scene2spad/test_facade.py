@@ -100,6 +100,8 @@ def test_optics_compute_the_photon_budget():
         (lambda h: s2s.render("plane", budget=(3,)), r"budget \(3,\), expected two numbers"),
         (lambda h: s2s.render("plane", budget=("a", 3)), r"budget \('a', 3\), expected two numbers"),
         (lambda h: s2s.render("plane", error="0.1"), "render: error '0.1', expected a number"),
+        (lambda h: s2s.render("plane", ambient="on"), "render: ambient 'on', expected True, False or None"),
+        (lambda h: s2s.render("no-such-scene", filter="on"), "render: filter 'on', expected True or False"),
         (lambda h: s2s.RenderSettings(filter="x"), "render: filter 'x', expected True or False"),
         (lambda h: s2s.RenderSettings(adaptive="no"), "render: adaptive 'no', expected True or False"),
         (lambda h: s2s.RenderSettings(ambient="x"), "render: ambient 'x', expected True, False or None"),

@@ -181,6 +181,21 @@ def test_envmap_is_mitsubas(tmp_path: Path, mitsuba: object, turn: str) -> None:
     assert any("mirrors" in note for note in scene.notes) == ("scale" in turn)
 
 
+def test_a_scaled_envmap_is_noted_as_mitsuba_distorts_it(tmp_path: Path, mitsuba: object) -> None:
+    """An envmap under a scale of 3 keeps its rotation here; in Mitsuba straight up shows its rows at acos(1/3)."""
+    exr(tmp_path / "sky.exr", np.repeat(np.repeat([[1.0], [2.0], [3.0]], 20, axis=0), 40, axis=1))
+    body = '<emitter type="envmap"><string name="filename" value="sky.exr"/>'
+    path = write(tmp_path, f'{RECTANGLE}{body}<transform name="to_world"><scale value="3"/></transform></emitter>')
+    scene = load_mitsuba_xml(path)
+    up = np.array([0.01, 0.9999, 0.01]) / np.linalg.norm([0.01, 0.9999, 0.01])
+    assert mitsuba(path, around=[up.tolist()])["around"] == pytest.approx([2.0], rel=1e-3)
+    assert around(scene.ambient, up) == pytest.approx(1.0, rel=1e-3)
+    assert any("scale of the environment map" in note for note in scene.notes)
+    turn = '<transform name="to_world"><rotate x="1" angle="5"/></transform></emitter>'
+    turned = write(tmp_path, RECTANGLE + body + turn)
+    assert not load_mitsuba_xml(turned).notes
+
+
 def test_lights(tmp_path: Path) -> None:
     body = RECTANGLE + '<emitter type="constant"><rgb name="radiance" value="0.2 0.4 0.6"/></emitter>'
     body += '<emitter type="point" id="lamp"/><emitter type="sunsky"/>'

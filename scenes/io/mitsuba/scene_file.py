@@ -224,6 +224,10 @@ def _envmap(document: Document, materials: Materials, emitter: Plugin) -> Ambien
     image = materials.image(path, emitter.boolean("raw", False), "luminance").image
     pose, mirrored = _rigid(emitter, "environment map")
     pose[:3, 3] = 0
+    size = math.cbrt(abs(np.linalg.det(emitter.transform("to_world")[:3, :3])))
+    if abs(size - 1) > ORTHONORMAL_TOLERANCE:
+        # there a direction's angle to +y is acos(y / size)
+        emitter.note("the scale of the environment map's to_world is left out, in Mitsuba it distorts the map")
     if mirrored:
         # Turning the map's x axis round and its columns round is the same map.
         image = image[:, ::-1]
