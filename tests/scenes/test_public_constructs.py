@@ -229,6 +229,39 @@ def test_instances_stand_where_their_transforms_put_them(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("inside", "words"),
+    [
+        (bsdf("diffuse"), "<bsdf> in a"),
+        ('<emitter type="area"/>', "<emitter> in a"),
+        ('<boolean name="flip_normals" value="true"/>', "parameter flip_normals is not used"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["instance", "merge", "shapegroup"])
+def test_what_containers_hold_beside_shapes_is_noted(folder: Path, kind: str, inside: str, words: str) -> None:
+    """Look, light and values beside a container's shapes change nothing, which is said."""
+    whole = {"merge": shape(RECTANGLE + inside, "merge"), "instance": GROUP + INSTANCE, "shapegroup": GROUP + INSTANCE}
+    body = whole[kind].replace('<ref id="g"/>', f'<ref id="g"/>{inside if kind == "instance" else ""}')
+    body = body.replace(RECTANGLE + "</shape>", RECTANGLE + (inside if kind == "shapegroup" else "") + "</shape>")
+    scene = load(folder, body)
+    assert [words in note for note in scene.notes] == [True]
+    assert scene.surfaces[0].emission == 0
+
+
+def test_the_transform_of_a_group_is_noted(folder: Path) -> None:
+    moved = '<transform name="to_world"><translate x="5"/></transform>'
+    scene = load(folder, GROUP.replace(RECTANGLE, moved + RECTANGLE) + '<shape type="instance"><ref id="g"/></shape>')
+    assert any("to_world of a shapegroup" in note for note in scene.notes)
+    assert scene.bounds()[1][0] == 1  # as Mitsuba's bounding box
+
+
+@pytest.mark.parametrize("value", ["true", "false"])
+def test_lamps_that_an_integrator_hides_are_noted(folder: Path, value: str) -> None:
+    inner = f'<integrator type="path"><boolean name="hideEmitters" value="{value}"/></integrator>'
+    scene = load(folder, f'{RECTANGLE}<integrator type="aov"><string name="aovs" value="d:depth"/>{inner}</integrator>')
+    assert any("hide_emitters" in note for note in scene.notes) == (value == "true")
+
+
+@pytest.mark.parametrize(
     ("body", "words"),
     [
         (shape("", "instance"), "of one shapegroup"),

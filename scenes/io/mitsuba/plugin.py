@@ -119,6 +119,11 @@ class Plugin:
         """Mark values as known and without a meaning here."""
         self._used.update(names)
 
+    def note_left_out(self, *tags: str, why: str) -> None:
+        """Say which nested plugins of these tags have no effect here, and why."""
+        for inner in self.nested(*tags):
+            self.note(f"<{inner.tag}> in a {self.type} is left out, {why}")
+
     def note_unused(self) -> None:
         """Say which values nobody asked for: a mistyped name must not go unnoticed."""
         for name in (*self._values, *(name for name, element in self._nested if element.tag == "texture")):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from scenes.errors import InputError
 from scenes.io.mitsuba.bsdf import Materials
 from scenes.io.mitsuba.clipping import is_cut
 from scenes.io.mitsuba.nodes import Document, LocatedError
-from scenes.io.mitsuba.plugin import VALUE_TAGS, Plugin
+from scenes.io.mitsuba.plugin import VALUE_TAGS, Plugin, snake_case
 from scenes.io.mitsuba.shapes import Shapes, shows_open_back
 from scenes.model import Ambient, Camera, Scene, Surface, Texture
 
@@ -55,6 +56,8 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
             raise document.error(element, _NO_MEDIA)
         elif element.tag not in _DEFINITIONS:
             raise document.error(element, "unknown element in a scene")
+        elif element.tag == "integrator":
+            _note_hidden(document, element)
     if not found["shape"]:
         raise InputError("holds no shapes")
     # what has no counterpart is told before meshes and images are read, which may take minutes
@@ -73,6 +76,14 @@ def _scene(document: Document, width: int | None, height: int | None) -> Scene:
     stem = document.path.stem
     name = document.path.resolve().parent.name if stem == "scene" else stem
     return Scene(name or stem, tuple(surfaces), camera, ambient=ambient, notes=document.notes.lines())
+
+
+def _note_hidden(document: Document, integrator: Element) -> None:
+    """Say that lamps are seen here which an integrator, or one inside it, hides from the camera."""
+    for flag in integrator.iter("boolean"):
+        hides = snake_case(flag.get("name", "")) == "hide_emitters"
+        if hides and flag.get("value", "").strip().lower() == "true":
+            document.notes.add("hide_emitters is left out, the camera sees lamps and the light around the scene")
 
 
 def _camera(document: Document, sensors: list[Plugin]) -> Camera:

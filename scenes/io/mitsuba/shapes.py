@@ -83,7 +83,12 @@ class Shapes:
 
     def surfaces(self, plugin: Plugin) -> list[Surface]:
         """Return the surfaces of a <shape> in the world: one, or those of an instance or a merge; none of a group."""
+        if plugin.type in _CONTAINERS:
+            plugin.note_left_out("bsdf", "emitter", why="shapes have those inside their own elements")
+            plugin.note_unused()
         if plugin.type == "shapegroup":
+            if plugin.has("to_world"):
+                plugin.note("to_world of a shapegroup is left out, as in Mitsuba")
             return []  # is seen where instances put it
         if plugin.type in _CONTAINERS:
             matrix = plugin.transform("to_world")
