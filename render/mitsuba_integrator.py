@@ -12,10 +12,11 @@ import numpy as np
 
 from render.backend.drjit_types import Array
 from render.backend.llvm import start_mitsuba
-from render.settings import RenderSettings
+from render.settings import MAX_BOUNCES, RenderSettings
 from render.transient import Transient
 from scenes.constants import SPEED_OF_LIGHT_M_PER_S
 from scenes.errors import InputError, listed, require
+from scenes.io.mitsuba.clipping import is_cut
 from scenes.io.textures import luminance
 from scenes.limits import require_memory
 from scenes.model import Camera, Material, Scene, Surface
@@ -83,7 +84,8 @@ def _integrator_class(name: str, variant: str) -> type:
             error = float(props["error"]) if "error" in props else None
             require(self.bins > 0, f"{name}: temporal_bins {self.bins} is not positive")
             require(0 < self.width_m < np.inf, f"{name}: bin_width_opl {self.width_m:g} m is not a positive length")
-            require(depth == -1 or depth >= 2, f"{name}: max_depth {depth}, expected -1 or at least 2")
+            good = depth == -1 or 2 <= depth <= MAX_BOUNCES + 1
+            require(good, f"{name}: max_depth {depth}, expected -1 or 2 to {MAX_BOUNCES + 1}")
             self.settings = RenderSettings(bounces=None if depth < 0 else depth - 1, error=error)
 
         def render(
@@ -125,7 +127,8 @@ def _rendered(scene: Scene, settings: RenderSettings, seed: int, variant: str) -
 def scene_from_mitsuba(scene: Array, sensor: Array) -> Scene:
     """Read a loaded Mitsuba scene: meshes, uniform diffuse or conducting materials, a perspective camera.
 
-    Materials whose back is black in Mitsuba reflect from both sides, with a line in its log. Raises InputError in one
+    Materials whose back is black in Mitsuba reflect from both sides, and what its clipping planes cut is seen, with a
+    line in its log each. Raises InputError in one
     line that names what has no counterpart here.
     """
     import mitsuba as mi
@@ -135,7 +138,13 @@ def scene_from_mitsuba(scene: Array, sensor: Array) -> Scene:
     one_sided = [shape.id() for shape in scene.shapes() if shape.bsdf().class_name() != "TwoSidedBRDF"]
     if one_sided:
         mi.Log(mi.LogLevel.Warn, f"{NAME}: shapes without twosided reflect from both sides here: {listed(one_sided)}")
-    return Scene("mitsuba", surfaces, _camera(sensor))
+    camera = _camera(sensor)
+    near_m, far_m = float(sensor.near_clip()), float(sensor.far_clip())
+    cut = [surface.name for surface in surfaces if is_cut(surface, camera, near_m, far_m)]
+    if cut:
+        limits = f"near_clip {near_m:g} or beyond far_clip {far_m:g}"
+        mi.Log(mi.LogLevel.Warn, f"{NAME}: shapes are seen here nearer than {limits}: {listed(cut)}")
+    return Scene("mitsuba", surfaces, camera)
 
 
 def _camera(sensor: Array) -> Camera:

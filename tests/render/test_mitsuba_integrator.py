@@ -146,6 +146,19 @@ def test_a_material_whose_back_is_black_in_mitsuba_is_named(capfd):
     assert "shapes without twosided reflect from both sides here: wall" in "".join(capfd.readouterr())
 
 
+@pytest.mark.parametrize(("near_m", "named"), [(0.1, False), (3.5, True)])
+def test_what_clipping_planes_cut_in_mitsuba_is_named(capfd, near_m, named):
+    described = wall()
+    described["sensor"]["near_clip"] = near_m
+    scene, level = mi.load_dict(described), mi.log_level()
+    mi.set_log_level(mi.LogLevel.Warn)
+    try:
+        scene_from_mitsuba(scene, scene.sensors()[0])
+    finally:
+        mi.set_log_level(level)
+    assert ("near_clip 3.5 or beyond far_clip 10000: wall" in "".join(capfd.readouterr())) == named
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -167,7 +180,10 @@ def test_what_has_no_counterpart_is_refused_by_name(change, message):
     assert isinstance(wrapped.value.__cause__, InputError)
 
 
-@pytest.mark.parametrize("bad", [{"temporal_bins": 0}, {"bin_width_opl": -1.0}, {"max_depth": 1}, {"error": 2.0}])
+BAD = [{"temporal_bins": 0}, {"bin_width_opl": -1.0}, {"max_depth": 1}, {"max_depth": 65}, {"error": 2.0}]
+
+
+@pytest.mark.parametrize("bad", BAD)
 def test_settings_out_of_range_are_refused(bad):
     with pytest.raises(RuntimeError) as wrapped:
         mi.load_dict({"type": "scene2spad", **bad})
