@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
 import struct
 from pathlib import Path
 
@@ -159,6 +160,28 @@ def test_inverse_bind_matrices_that_are_not_there_are_refused(tmp_path: Path) ->
     nodes: list[dict] = [{"mesh": 0, "skin": 0}, *({} for _ in range(3))]
     with pytest.raises(InputError, match="inverse bind matrices are cut short"):
         loaded(glb(tmp_path / "a.glb", nodes, skins=[{**BIND, "joints": [1, 2, 3]}]))
+
+
+def test_cameras_and_lights_and_bumps_that_are_left_out_are_noted(tmp_path: Path) -> None:
+    lamp = {"name": "sun", "extensions": {"KHR_lights_punctual": {"light": 0}}}
+    nodes = [{"mesh": 0}, {"name": "view", "camera": 0}, lamp]
+    scene = load_mesh(
+        glb(
+            tmp_path / "a.glb",
+            nodes,
+            meshes=[mesh(material=0)],
+            materials=[{"name": "brick", "normalTexture": {"index": 0}}],
+            cameras=[{"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.1}}],
+            extensionsUsed=["KHR_lights_punctual"],
+            extensions={"KHR_lights_punctual": {"lights": [{"type": "directional"}]}},
+        ),
+        placing=AS_FILE,
+    )
+    for words in ("cameras are left out.*: view", "lights of KHR_lights_punctual.*: sun", "normalTexture.*: brick"):
+        assert sum(bool(re.search(words, note)) for note in scene.notes) == 1, words
+    assert len(scene.surfaces) == 1
+    plain = load_mesh(glb(tmp_path / "b.glb", [{"mesh": 0}]), placing=AS_FILE)
+    assert not any("left out" in note for note in plain.notes)
 
 
 @pytest.mark.parametrize(

@@ -116,15 +116,17 @@ def _name(material: JsonObject) -> str:
 
 
 def _metal_and_glow(materials: list[JsonObject]) -> list[str]:
-    """Name the materials that are metal, as they are where metallicFactor is not given, and those that glow."""
+    """Name the materials that are metal, as they are where metallicFactor is not given, that glow, or have bumps."""
     looks = [(_name(one), one.get("pbrMetallicRoughness"), one) for one in materials]
     metal = [
         name for name, pbr, one in looks if pbr is not None and _is_lit(one) and _is_some(pbr, "metallicFactor", 1)
     ]
     glow = [name for name, _, one in looks if _is_some(one, "emissiveFactor", 0)]
+    bumpy = [name for name, _, one in looks if "normalTexture" in one]
     lines = (
         ("metallicFactor (1 unless given) is left out, their surfaces are diffuse", metal),
         ("emissiveFactor is left out, their surfaces give no light", glow),
+        ("normalTexture is left out, their surfaces keep their own normals", bumpy),
     )
     return [f"{words}: {listed(list(dict.fromkeys(names)))}" for words, names in lines if names]
 

@@ -11,6 +11,7 @@ from scenes.io.mesh_formats.glb_coordinates import FLOAT, accessor_numbers
 from scenes.json_types import JsonObject
 
 VISIBILITY = "KHR_node_visibility"
+LIGHTS = "KHR_lights_punctual"
 _FLAT = 1e-9  # shortest to longest axis of a unit sphere under a transform, below which a body is squashed flat
 _ALIKE = 1e-5  # relative difference of joints' transforms: inverse bind matrices are in single precision
 
@@ -30,13 +31,16 @@ def plain_nodes(header: JsonObject, binary: bytes) -> list[str]:
     shown, worlds = _worlds(header)
     invisible = _invisible(nodes)
     hidden, unseen, posed, morphed = [], [], [], []
+    cameras, lights = list[str](), list[str]()
     parts: dict[int, list[int]] = {}
     for number in shown:
         node = nodes[number]
-        node.pop("camera", None)
+        label = str(node.get("name", number))
+        cameras += [label] * (node.pop("camera", None) is not None)
+        lights += [label] * (LIGHTS in node.get("extensions", {}) and number not in invisible)
         if "mesh" not in node:
             continue
-        label, mesh = str(node.get("name", number)), meshes[node["mesh"]]
+        mesh = meshes[node["mesh"]]
         if number in invisible:
             unseen.append(label)
             del node["mesh"]
@@ -63,6 +67,8 @@ def plain_nodes(header: JsonObject, binary: bytes) -> list[str]:
         ("scaled to nothing by their nodes and left out", hidden),
         ("the pose of a skin is left out, the first joint alone places the mesh", posed),
         ("morph targets are left out, meshes are as without", morphed),
+        ("cameras are left out, a view is stated beside the file (--from, --look-at, --fov)", cameras),
+        (f"lights of {LIGHTS} are left out", lights),
     )
     return [f"{words}: {listed(names)}" for words, names in lines if names]
 
