@@ -152,3 +152,10 @@ def test_metal_glow_and_clipped_colours_are_noted_in_a_line_each(tmp_path: Path)
         "Pm is left out, its surfaces are diffuse: oak, elm",
     )
     assert not any(word in note for note in load(tmp_path, dark).notes for word in ("Kd", "Ke", "Pm"))
+
+
+@pytest.mark.parametrize("line", ["map_Bump -bm 0.5 bumps.png", "bump bumps.png", "norm n.png", "disp d.png"])
+def test_bumps_are_noted(tmp_path: Path, line: str) -> None:
+    key = line.split()[0]
+    notes = load(tmp_path, f"newmtl oak\nKd 0.5 0.5 0.5\n{line}\n").notes
+    assert f"{key} is left out, its surfaces keep their own shape: oak" in notes

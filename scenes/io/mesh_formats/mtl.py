@@ -31,6 +31,7 @@ _LOOKS = {
     "map_ke": "its surfaces give no light",
     "pm": "its surfaces are diffuse",
     "map_pm": "its surfaces are diffuse",
+    **dict.fromkeys(("bump", "map_bump", "norm", "disp"), "its surfaces keep their own shape"),
 }
 
 
