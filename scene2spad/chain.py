@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from csph.codes.tensor import CodingTensor
     from csph.networks.model import DepthModel
     from csph.weights.cards import Card
+    from render.settings import RenderSettings
     from render.transient import Transient
     from scenes.model import Scene
     from scenes.placing import Placing
@@ -77,12 +78,10 @@ def render(
     (6, 8)
     """
     from render.engine import render as render_scene
-    from render.settings import RenderSettings
     from scenes.model import Scene
 
     _check_progress(progress)
-    _check_settings(settings, [field.name for field in fields(RenderSettings)])
-    chosen = RenderSettings(**settings)
+    chosen = _checked_settings(settings)
     if not isinstance(scene, Scene):
         scene = _loaded(str(scene), seed, width, height, placing)
     elif width is not None or height is not None or placing is not None:
@@ -110,13 +109,17 @@ PLACING = {"up": "up", "scale": "scale", "bare": "bare", "from_": "origin", "loo
 PLACING |= {field: field for field in PLACING.values()}
 
 
-def _check_settings(settings: dict[str, Any], known: list[str]) -> None:
-    """Raise InputError for unknown settings."""
+def _checked_settings(settings: dict[str, Any]) -> RenderSettings:
+    """Return settings given by name; raise InputError for unknown ones and values of another kind or out of range."""
+    from render.settings import RenderSettings
+
+    known = [field.name for field in fields(RenderSettings)]
     for name, value in settings.items():
         if name in PLACING:
             field = PLACING[name]
             raise InputError(f"render: {name!r} is no setting, give placing=scene2spad.Placing({field}={value!r})")
         require(name in known, f"render: setting {name!r} is unknown{did_you_mean(name, known)}")
+    return RenderSettings(**settings)
 
 
 def sense(
