@@ -128,8 +128,7 @@ def scene_from_mitsuba(scene: Array, sensor: Array) -> Scene:
     """Read a loaded Mitsuba scene: meshes, uniform diffuse or conducting materials, a perspective camera.
 
     Materials whose back is black in Mitsuba reflect from both sides, and what its clipping planes cut is seen, with a
-    line in its log each. Raises InputError in one
-    line that names what has no counterpart here.
+    line in its log each. Raises InputError in one line that names what has no counterpart here.
     """
     import mitsuba as mi
 
