@@ -86,7 +86,7 @@ class ModelConfig:
         require(coded == (self.design is not None), f"front {self.front}: {'a' if coded else 'no'} design is expected")
         switches = ", ".join(sorted(name for name, on in self.layer.items() if on))
         require(coded or not switches, f"layer {switches}: is for codes, and there are none")
-        self._check_network()
+        self._check_network(coded)
         if self.design is not None:
             bins, block = self.sensor.bins, self.design.block
             folded = not self.sees_codes or block[0] % 16 == 0
@@ -97,9 +97,10 @@ class ModelConfig:
             require(not (counted and self.layer.get("int8")), rounded)
             message = "1 code: its mean over K is itself and is removed, which leaves zeros; expected 2 or more"
             require(self.design.codes > 1 or bool(self.layer.get("keep_mean")), f"{message}, or --layer keep_mean")
+            mean = "blocks of 1 bin: a code's mean over its bins is removed, which leaves zeros; expected 2 or more"
+            require(block[0] > 1 or not self.layer.get("zero_mean", self.design.zero_mean), mean)
 
-    def _check_network(self) -> None:
-        coded = self.front == "codes"
+    def _check_network(self, coded: bool) -> None:
         require(coded or not self.sees_codes, f"network {self.network}: is for codes, and there are none")
         require(self.network != "periodic" or self._on_a_circle, self._no_circle)
         unit = 32 if self.network == "periodic" else 16
@@ -273,10 +274,8 @@ class TrainConfig:
     def check_memory(self) -> None:
         """Raise InputError unless the least that one step holds fits in memory: ask before sets are read."""
         counts = self.batch * self.crop**2 * self.model.sensor.bins
-        message = (
-            f"a step of {self.batch} patches of {self.crop} x {self.crop} pixels and {self.model.sensor.bins} bins"
-        )
-        require_memory(COUNT_BYTES * counts, message)
+        patch = f"{self.crop} x {self.crop} pixels and {self.model.sensor.bins} bins"
+        require_memory(COUNT_BYTES * counts, f"a step of {self.batch} patches of {patch}")
 
     def to_dict(self) -> JsonObject:
         """Return every number as JSON holds it."""

@@ -191,6 +191,7 @@ def test_gray_fourier_takes_any_pulse():
     ("make", "message"),
     [
         (lambda: ModelConfig(design=Design("learned", (256, 1, 1), 1)), "leaves zeros"),
+        (lambda: ModelConfig(design=Design("learned", (1, 2, 2), 2)), "blocks of 1 bin: .* leaves zeros"),
         (lambda: Design("furier", (256, 1, 1), 4), "did you mean 'fourier'"),
         (lambda: Design("learned", (256, 1, 1), 4.0), "4.0 codes over a block of 256 x 1 x 1, expected a whole number"),
         (lambda: Design.named("lerned", (256, 1, 1), codes=4), "did you mean 'learned'"),
