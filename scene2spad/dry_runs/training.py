@@ -41,7 +41,7 @@ def dry_run(command: Train) -> dict:
     config.check_memory()
     require(bool(command.set), "train: --set without a set")
     check_workers(command.workers, least=0)
-    check_sets(command)
+    check_sets(command, config.crop)
     begun_with(command, config)
     for warning in level_warnings(config):
         log.warning("%s", warning)

@@ -171,9 +171,10 @@ def _default_network(command: Train, design: Design | None) -> Network:
     return "refined" if coded and command.preset in ON_CPU else "compact"
 
 
-def views_of(command: Train) -> tuple[list[Views], list[Views], dict[str, object]]:
-    """Return training and validation views of every set, and the words that say which they are."""
-    sets = [_views_of_set(path, command) for path in command.set]
+def views_of(command: Train, crop: int) -> tuple[list[Views], list[Views], dict[str, object]]:
+    """Return training and validation views of every set, and the words that say which they are. Raises InputError for
+    training views that hold no patch of `crop` pixels a side."""
+    sets = [_views_of_set(path, command, crop) for path in command.set]
     check_once("set", command.set, sets)
     common = {"training": _paths(command.set), "validation": _paths(command.validation) or "its last scenes"}
     if command.validation:
@@ -217,15 +218,29 @@ def _split(path: Path, views: Views) -> tuple[Views, Views]:
         raise InputError(f"{path}: {error}") from None
 
 
-def _views_of_set(path: Path, command: Train) -> Views:
-    if path != PLANES:
-        return _views_of_one_size(path)
-    pixels = SMOKE_PIXELS if command.preset == "smoke" else 64
-    return random_planes(PLANE_SCENES[command.preset], size=pixels, seed=command.seed)
+def _views_of_set(path: Path, command: Train, crop: int) -> Views:
+    if path == PLANES:
+        _check_crop(path, _plane_pixels(command), crop)
+        return random_planes(PLANE_SCENES[command.preset], size=_plane_pixels(command), seed=command.seed)
+    views = _views_of_one_size(path)
+    first = views.transients[0]
+    _check_crop(path, min(first.height, first.width), crop)
+    return views
+
+
+def _plane_pixels(command: Train) -> int:
+    return SMOKE_PIXELS if command.preset == "smoke" else 64
+
+
+def _check_crop(path: Path, side: int, crop: int) -> None:
+    message = f"train: --set {path}: crops of {crop} pixels do not fit views of {side}; give a smaller --crop"
+    require(crop <= side, message)
 
 
 def _views_of_one_size(path: Path) -> Views:
-    """Read a rendered set; InputError for views of several sizes, of which no batch is made."""
+    """Read a rendered set; InputError for other files, and views of several sizes, of which no batch is made."""
+    other = path.is_file() and path.suffix.lower() != ".h5"
+    require(not other, f"{path}: expected the folder of a set that `dataset` rendered, or its pack (.h5)")
     views = read_views(path)
     sizes = sorted({(one.width, one.height) for one in views.transients})
     several = " and ".join(f"{width} x {height}" for width, height in sizes[:2])
@@ -233,10 +248,12 @@ def _views_of_one_size(path: Path) -> Views:
     return views
 
 
-def check_sets(command: Train) -> None:
+def check_sets(command: Train, crop: int) -> None:
     """Raise InputError where the run would: for a set that cannot be read or trained on, or not be validated on. Planes
-    always can, and are not drawn."""
-    views_of(replace(command, set=tuple(path for path in command.set if path != PLANES)))
+    are not drawn for it."""
+    if PLANES in command.set:
+        _check_crop(PLANES, _plane_pixels(command), crop)
+    views_of(replace(command, set=tuple(path for path in command.set if path != PLANES)), crop)
 
 
 def _paths(paths: Sequence[Path]) -> str | list[str]:
@@ -262,7 +279,7 @@ def run_train(command: Train, progress: Progress) -> dict:
     init = begun_with(command, config)
     from csph.training.loop import Hardware, train  # and Lightning, which takes seconds to import
 
-    training, validation, data = views_of(command)
+    training, validation, data = views_of(command, config.crop)
     data |= config.data
     warn_of_inherited(init, validation)
     first = training[0].transients[0]

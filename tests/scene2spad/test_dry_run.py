@@ -8,7 +8,10 @@ from types import SimpleNamespace
 import pytest
 
 from csph.weights.shipped import RESUME
+from render.transient.packs import write_pack
 from scene2spad.cli import main
+from scene2spad.cli.opening import EXR_SIGNATURE
+from scene2spad.datasets.planes import random_planes
 from scene2spad.dry_runs.rendering import (
     LIBRARY_BYTES,
     MEMORY_MARGIN,
@@ -160,6 +163,25 @@ def test_a_dry_training_refuses_the_folders_that_the_training_does(capfd, folder
         for dry in ([], ["--dry-run"]):
             assert main(["train", "--preset", "smoke", "--out", out, *dry]) == 2
             assert f"{out}: {line}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--dry-run"], []])
+def test_views_that_hold_no_patch_are_named_by_dry_trainings_as_by_others(capfd, folder, words):
+    """A dry run promised seconds for such a training, which then did not say which set it was."""
+    write_pack([(view, {"scene": f"wall {i}"}) for i, view in enumerate(random_planes(2, size=4).transients)], "few.h5")
+    small = "few.h5: crops of 8 pixels do not fit views of 4; give a smaller --crop"
+    for more, refusal in ((["few.h5", "planes"], small), (["planes", "--crop", "64"], "planes: crops of 64 pixels")):
+        assert main(["train", "--preset", "smoke", "--set", *more, "--out", "mine", *words]) == 2
+        assert f"train: --set {refusal}" in capfd.readouterr().err
+    assert files(folder) == ["few.h5"]
+
+
+def test_other_files_are_no_training_sets(capfd, folder):
+    """They were called damaged packs."""
+    Path("view.exr").write_bytes(EXR_SIGNATURE)
+    assert main(["train", "--preset", "smoke", "--set", "view.exr", "--out", "mine"]) == 2
+    expected = "view.exr: expected the folder of a set that `dataset` rendered, or its pack (.h5)"
+    assert expected in capfd.readouterr().err
 
 
 def test_a_dry_study_tells_models_and_recorded_runs(capfd, folder):
