@@ -115,7 +115,10 @@ def _design_of(command: Train) -> Design | None:
         return Design.named(
             command.design, command.block, codes=command.codes, compression=compression, full=command.full
         )
-    design, _ = own_codes(codes_path(command.codes_file, folder_of(command)))
+    design, coding = own_codes(codes_path(command.codes_file, folder_of(command)))
+    alike = design.codes > 1 and bool((coding.tensor == coding.tensor[:1]).all())
+    zeros = f"{command.codes_file}: all its codes are the same: their mean over K is removed, which leaves zeros"
+    require(not alike or "keep_mean" in command.layer, f"{zeros}; --layer keep_mean keeps it")
     asked = {
         "--block": (command.block, (Train.block, design.block)),
         "--codes": (command.codes, (None, design.codes)),

@@ -132,6 +132,11 @@ def test_options_that_agree_with_the_file_are_taken(capfd):
 def test_codes_that_tell_nothing_are_refused_and_dependent_ones_told(capfd):
     np.save("zero.npy", np.zeros((4, 1024)))
     assert refused(capfd, *TRAIN, "zero.npy", "--out", "zero") == "scene2spad: zero.npy: all codes are zero"
+    np.save("alike.npy", np.repeat(ROWS[:1], 4, 0))
+    for dry in ([], ["--dry-run"]):  # a network of nothing but zeros had been trained
+        message = refused(capfd, *TRAIN, "alike.npy", "--out", "alike", *dry)
+        assert "alike.npy: all its codes are the same: their mean over K is removed, which leaves zeros" in message
+    assert run(capfd, *TRAIN, "alike.npy", "--layer", "keep_mean", "--out", "alike", "--dry-run")["dry_run"]
     np.save("twice.npy", np.concatenate([ROWS, ROWS]))
     assert main([*TRAIN, "twice.npy", "--out", "twice"]) == 0
     assert "twice.npy: its 16 codes have rank 8: the others follow from so many" in capfd.readouterr().err
