@@ -118,7 +118,7 @@ def test_the_network_sees_what_the_file_has(capfd):
     ],
 )
 def test_options_that_do_not_go_with_a_file_of_codes(capfd, options, message):
-    np.save("odd.npy", np.ones((8, 1000)))
+    np.save("odd.npy", np.eye(8, 1000))
     np.save("nan.npy", np.full((2, 1024), np.nan))
     assert message in refused(capfd, *TRAIN, *options, "--out", "run") and not Path("run").exists()
 
