@@ -26,6 +26,9 @@ SMALL = 1 / 32
 SMALL_FROM_LASER = 1 / 8
 HIT, LIT, LARGE, CLIPPED = 1, 2, 4, 8
 LEVEL_BIT = 24  # rows of cells stay below 2^24
+GOLDEN = 2654435769  # fraction of the golden ratio, (sqrt(5) - 1) / 2, in units of 2^-32
+# Rays move by at most half of this share of a cell's width: it does best over straight and round edges (measured).
+MOVED = 0.75
 
 
 class Footprints(NamedTuple):
@@ -99,8 +102,10 @@ def _cell(world: TracedScene, column: UInts, packed: UInts, grid: UInts) -> _Cel
     pitch = dr.rcp(Float(side))
     x, y = (Float(column) + 0.5) * pitch, (Float(row) + 0.5) * pitch
     # not by integer division: lanes that pad the last packet hold anything, and a division by their 0 is fatal
-    pixel = UInt32(y) * world.width + UInt32(x)
-    return _Cell(x, y, pitch, pitch / world.focal_px, pixel, *_off_centre(column, row, level))
+    pixel_column, pixel_row = UInt32(x), UInt32(y)
+    aside = _off_centre(row, level, pixel_row, grid, 1)
+    down = _off_centre(column, level, pixel_column, grid, -1)
+    return _Cell(x, y, pitch, pitch / world.focal_px, pixel_row * world.width + pixel_column, aside, down)
 
 
 def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *, clip: bool) -> tuple:
@@ -212,17 +217,20 @@ def _clip_to_face(
     return dr.select(cut, 0.5 * (low + high), path), dr.select(cut, 0.5 * (high - low), half), cut
 
 
-def _off_centre(column: UInts, row: UInts, level: UInts) -> tuple[Array, Array]:
-    """Compute a ray's offset from the centre of its cell along x and y, in cell widths: 0 in cells of level 0.
+def _off_centre(number: UInts, level: UInts, pixel_number: UInts, grid: UInts, way: int) -> Array:
+    """Compute how far off their cells' centres the rays of row `number` are moved along it, in cell widths; or those of
+    a column along the column.
 
-    Cells that were cut lie along edges, and edges of rooms run along rows or columns: with rays in the middle all cells
-    of a row would round to the same side. So a row's rays are moved along it, and a column's along the column, by
-    multiples of the golden ratio modulo 1, which cut any stretch of neighbours evenly. Three quarters of the cell's
-    width do best over straight and round edges (measured).
+    Edges of rooms run along rows or columns: with rays in the middle all cells of a row would round to the same side.
+    Multiples of the golden ratio modulo 1 cut any stretch of neighbours evenly. In pixels that are not cut they count
+    from the pixel's middle, and are rounded to the nearest: then rows that face each other move in opposite ways, and
+    the mean over a radiance that rises evenly stays exact. Rows and columns move in opposite `way`s there, as if the
+    rays of a pixel were turned: then a radiance that is twisted, as x y, keeps its mean, too.
     """
-    cut = dr.select(level > 0, Float(0.75 * 2.0**-24), 0)
-    golden = UInt32(2654435769)  # 2^32 (sqrt(5) - 1) / 2
-    return tuple((Float(number * golden >> 8) - 2.0**23) * cut for number in (row, column))
+    cut = (Float(number * UInt32(GOLDEN) >> 8) - 2.0**23) * 2.0**-24
+    from_middle = Float(number) - dr.fma(Float(pixel_number) + 0.5, Float(grid), -0.5)
+    turns = from_middle * (way * GOLDEN * 2.0**-32)
+    return dr.select(level > 0, cut, turns - dr.round(turns)) * MOVED
 
 
 def _glint(
