@@ -13,7 +13,7 @@ from render.settings import RenderSettings
 from scene2spad.bench.hard import oracles
 from scenes import Material, Scene
 
-ROUGHNESS, PER_SIDE, DISTANCE_M = 0.4, 6, 2.0
+ROUGHNESS, PER_SIDE, DISTANCE_M = 0.4, 16, 2.0
 KINDS = {
     "roughconductor": {"eta": 1.5, "k": 6.0},
     "roughplastic": {"albedo": 0.2, "ior": 1.5},
