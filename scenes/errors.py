@@ -99,17 +99,20 @@ def normalise_fields(owner: DataclassInstance, where: str) -> None:
     Raises InputError that names the first field of another kind, its value, and what is expected; `where` comes first.
     Its module must postpone annotations, which then are the words that the source has.
     """
+    kinds: dict[str, str] = {}  # not of the fields' `type`, which libraries that walk over dataclasses replace
+    for cls in reversed(type(owner).__mro__):
+        kinds |= vars(cls).get("__annotations__", {})
     for item in fields(owner):
-        value, what = getattr(owner, item.name), f"{where}: {item.name}"
-        if value is None and str(item.type) in ("int | None", "float | None"):
+        value, what, kind = getattr(owner, item.name), f"{where}: {item.name}", kinds[item.name]
+        if value is None and kind in ("int | None", "float | None"):
             continue
-        if item.type in ("int", "int | None"):
+        if kind in ("int", "int | None"):
             object.__setattr__(owner, item.name, require_whole(value, what))
-        elif item.type in ("float", "float | None"):
+        elif kind in ("float", "float | None"):
             object.__setattr__(owner, item.name, require_number(value, what))
-        elif item.type == "bool":
+        elif kind == "bool":
             require(isinstance(value, bool), f"{what} {value!r}, expected True or False")
-        elif item.type == "str":
+        elif kind == "str":
             require(isinstance(value, str), f"{what} {value!r}, expected text")
 
 

@@ -58,7 +58,7 @@ def test_depth_by_the_path_of_a_model(tmp_path):
     histogram = s2s.sense(transient, signal=50, background=5)
     found = s2s.estimate_depth(histogram, shipped_file("none-s0"))
     assert (found == s2s.estimate_depth(histogram, "none-s0")).all()
-    with pytest.raises(InputError, match="depth method None: expected a name"):
+    with pytest.raises(InputError, match="depth method of type NoneType: expected a name"):
         s2s.estimate_depth(histogram, None)
     with pytest.raises(InputError, match=r"^seed -1: expected a whole number, 0 or more$"):
         s2s.sense(transient, seed=-1)

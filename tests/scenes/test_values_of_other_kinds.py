@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from fractions import Fraction
 
 import numpy as np
@@ -159,3 +160,17 @@ def test_surfaces_and_notes_come_from_any_iterable() -> None:
 )
 def test_loading_with_a_value_of_another_kind_is_refused(name: str, given: dict, message: str) -> None:
     assert message in refused(lambda: load_scene(name, **given))
+
+
+def test_kinds_are_those_of_the_source_whatever_becomes_of_a_fields_type():
+    """Libraries that walk over dataclasses replace the words of a field's type by the type itself."""
+    kept = [(item, item.type) for item in fields(RenderSettings)]
+    try:
+        for item, _ in kept:
+            item.type = object
+        assert refused(lambda: RenderSettings(filter="on")) == "render: filter 'on', expected True or False"
+        assert refused(lambda: RenderSettings(direct_tolerance_m="a")).endswith("expected a number")
+        assert type(RenderSettings(indirect_growth=np.float32(0.5)).indirect_growth) is float
+    finally:
+        for item, kind in kept:
+            item.type = kind
