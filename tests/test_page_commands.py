@@ -99,7 +99,7 @@ def shrunk(words: list[str]) -> list[str]:
     if words[0] == "render" and words[1].endswith(".png"):
         small = {"--bounces": "1"}  # the photograph says the size
     if "--dry-run" in words or (words[0] == "study" and ("--preset" in words or words[1] in NO_PRESET)):
-        small = {}
+        small = {"--crop": "8"} if words[0] == "train" else {}  # the views are small, and a dry run says so
     kept, skipping = [], False
     for word in words:
         if word.startswith("--"):

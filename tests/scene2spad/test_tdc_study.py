@@ -105,7 +105,8 @@ def test_a_small_run(tmp_path, capfd) -> None:
     assert (out / "tdc.png").is_file() and (out / "tdc.csv").is_file()
     by = {(row["method"], row["clock"]): row for row in shown["compared"]}
     exact = by["log-matched, all bins", TABLE]
-    assert exact["mae_mm"] < by["log-matched, all bins", REAL]["mae_mm"]
+    # the mean hangs on the few pixels that are metres off, and these on the draw of photons
+    assert exact["within_10mm"] > 2 * by["log-matched, all bins", REAL]["within_10mm"]
     chip = [row for row in shown["compared"] if row["method"].endswith(study.CHIP)]
     assert [row["clock"] for row in chip] == [study.SENSED[0], REAL, DELAY, *study.SENSED[2:]]
     assert any(row["clock"] == TRAINED for row in shown["compared"])
