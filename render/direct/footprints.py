@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Interactions, Masks, Rays, UInts, Vectors
-from render.scene.rays import camera_rays, first_opaque, laser_leg, shape_index, tangent_motion, to_camera
+from render.scene.rays import PLAIN_GOLDEN, camera_rays, first_opaque, laser_leg, shape_index, tangent_motion, to_camera
 from render.scene.refraction import bundle_of, refracted_hit
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi, upload
 
@@ -26,7 +26,6 @@ SMALL = 1 / 32
 SMALL_FROM_LASER = 1 / 8
 HIT, LIT, LARGE, CLIPPED = 1, 2, 4, 8
 LEVEL_BIT = 24  # rows of cells stay below 2^24
-GOLDEN = 2654435769  # fraction of the golden ratio, (sqrt(5) - 1) / 2, in units of 2^-32
 # Rays move by at most half of this share of a cell's width: it does best over straight and round edges (measured).
 MOVED = 0.75
 FINE = 8  # rows a pixel, from which on rays in the middle do as well where nothing is cut (measured)
@@ -228,9 +227,9 @@ def _off_centre(number: UInts, level: UInts, pixel_number: UInts, grid: UInts, w
     the mean over a radiance that rises evenly stays exact. Rows and columns move in opposite `way`s there, as if the
     rays of a pixel were turned: then a radiance that is twisted, as x y, keeps its mean, too.
     """
-    cut = (Float(number * UInt32(GOLDEN) >> 8) - 2.0**23) * 2.0**-24
+    cut = (Float(number * UInt32(PLAIN_GOLDEN) >> 8) - 2.0**23) * 2.0**-24
     from_middle = Float(number) - dr.fma(Float(pixel_number) + 0.5, Float(grid), -0.5)
-    turns = from_middle * (way * GOLDEN * 2.0**-32)
+    turns = from_middle * (way * PLAIN_GOLDEN * 2.0**-32)
     uncut = dr.select(grid < FINE, turns - dr.round(turns), 0)
     return dr.select(level > 0, cut, uncut) * MOVED
 

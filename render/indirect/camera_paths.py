@@ -38,10 +38,16 @@ from render.indirect.light_vertices import (
 from render.indirect.path_space_filter import Point, late_from, point_of
 from render.indirect.path_suffixes import PathSuffixes, Slots, SuffixTask, slots_for, trace_suffixes
 from render.indirect.primary_vertices import PrimaryVertices, connect_primary_vertices, reuses_early_paths
-from render.scene.rays import camera_rays, first_opaque, interaction_from_parts, kept, parts_of, shape_index
+from render.scene.rays import (
+    PLAIN_GOLDEN,
+    camera_rays,
+    first_opaque,
+    interaction_from_parts,
+    kept,
+    parts_of,
+    shape_index,
+)
 from render.scene.traced_scene import Float, TracedScene, UInt32, dr, mi, upload
-
-PLAIN_GOLDEN = 2654435769  # bits of the golden ratio, in units of 2^-32
 
 
 class PathBatch(NamedTuple):

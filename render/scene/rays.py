@@ -12,6 +12,7 @@ MIN_SHADING_COSINE = 1e-4
 # Of the largest coordinate from the camera: float32 hardly tells apart what is closer.
 TOUCHING = 5e-7
 PARALLEL = 1 - 1e-6  # cosine between two faces of a slab, as float32 rounds it
+PLAIN_GOLDEN = 2654435769  # fraction of the golden ratio, (sqrt(5) - 1) / 2, in units of 2^-32
 BEFORE_END = 1e-4  # of a ray's length: so far before its end nothing stops it
 
 

@@ -183,3 +183,9 @@ def test_places_of_a_core_are_two_whole_numbers_from_0(place):
 def test_an_array_of_more_cores_than_memory_holds_is_refused():
     message = refused(lambda: CoreArray(COARSE, (10**6, 10**6)))
     assert message.startswith("a core array of 1000000 x 1000000: needs ")
+
+
+def test_programs_too_large_for_the_core_name_their_codes():
+    message = refused(lambda: method("fourier-900").program())
+    assert message.startswith("program fourier-900: 900 codes do not fit the core (") and "RAM address 512" in message
+    assert refused(lambda: method("learned-4").program()).startswith("program learned-4: 8480 bits of RAM")

@@ -235,18 +235,6 @@ ADAPTIVE = ".space sum, s16, 2\nloop: BNT idle\nRDT r1\n{body}\nJMP loop\nidle: 
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("fourier-900", "program fourier-900: 900 codes do not fit the core .*RAM address 512"),
-        ("learned-4", "^program learned-4: 8480 bits of RAM"),
-    ],
-)
-def test_programs_too_large_for_the_core_name_their_codes(name, message):
-    with pytest.raises(InputError, match=message):
-        method(name).program()
-
-
-@pytest.mark.parametrize(
     ("body", "message"),
     [
         ("LDH r2, [sum]\nBBS r2, #3, skip\nADDM [sum], r1\nskip:", "how long timestamp"),
