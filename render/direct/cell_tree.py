@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from render.direct.edges import CUT, GLINT, MIXED, Cells, Place, Tree, child_edges, first_edges
+from render.direct.edges import (
+    CUT,
+    GLINT,
+    HIGHLIGHT,
+    MIXED,
+    SURFACE,
+    Cells,
+    Place,
+    Table,
+    Tree,
+    child_edges,
+    first_edges,
+)
 from render.direct.footprints import CLIPPED, LARGE, Footprints, trace
 from render.scene.traced_scene import TracedScene, aligned
 
@@ -18,39 +32,30 @@ MAX_LAUNCHES = 256
 # long as ten thousand rays, and the last few edges are worth less (measured in rooms: 4 % more error, 26 % less time).
 LAST_FRACTION = 1 / 32
 
-_TYPES: dict[str, type[np.generic]] = dict.fromkeys(("rank", "column", "row", "level", "child"), np.int32)
-_TYPES |= dict.fromkeys(Footprints._fields, np.float32) | {"flags": np.uint32}
-_GLINTS = tuple(Footprints._field_defaults)  # kept of worlds that have some
-# a cut cell's children: (0, 0), (1, 0), (0, 1), (1, 1) in (column, row)
-_CHILD_COLUMN, _CHILD_ROW = np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1])
+# columns of tables
+PIXEL, LEVEL, COLUMN, ROW = range(len(Place._fields))
+FLAGS = SURFACE.index("flags")
+# a cut cell's children, in the order of their rows: by how much level, column and row differ from twice the cell's
+_CHILDREN = np.array([(0, 1, 0, 0), (0, 1, 1, 0), (0, 1, 0, 1), (0, 1, 1, 1)], np.int32)
+_SPANS = ("path_m", "half_width_m", "minor_m")
+_COLUMNS = (*_SPANS, "energy")
 
 
 class CellTree:
     """Cells of the pixels `pixels` (sorted flat indices), grid x grid each at level 0, half as wide with every level.
 
-    One array per property, `used` cells long, children after their parents and four in a row. `rank` is the place in
-    `pixels`; `column`, `row` count cells of the same level from the image's corner; `child` is the first of a cell's
-    four children, -1 for a leaf; the rest is the cell's `Footprints`. `mixed` (pixels,) is true where neighbouring
-    cells of a pixel hold surfaces more than 50 mm apart, or a surface and nothing; `rays` counts.
+    Cells are the first `used` rows of arrays, children after their parents and four in a row. `child` is the first of a
+    cell's four children, -1 for a leaf; the other columns are those of `render.direct.footprints.Footprints`, and
+    `table` holds what cells are compared by. `mixed` (pixels,) is true where neighbouring cells of a pixel hold
+    surfaces more than 50 mm apart, or a surface and nothing; `rays` counts.
     """
 
-    rank: np.ndarray
-    column: np.ndarray
-    row: np.ndarray
-    level: np.ndarray
-    child: np.ndarray
     path_m: np.ndarray
     half_width_m: np.ndarray
     minor_m: np.ndarray
-    radiance: np.ndarray
-    distance_m: np.ndarray
-    slope_x_m: np.ndarray
-    slope_y_m: np.ndarray
-    facing: np.ndarray
-    flags: np.ndarray
-    tilt_x: np.ndarray | None
-    tilt_y: np.ndarray | None
-    peak: np.ndarray | None
+    energy: np.ndarray
+    child: np.ndarray
+    table: Table
 
     def __init__(self, world: TracedScene, pixels: np.ndarray, grid: int) -> None:
         self.world, self.pixels, self.grid = world, pixels, grid
@@ -64,14 +69,18 @@ class CellTree:
         self.used = self.rays = 0
         self.least = np.float32(0)
         self.mixed = np.zeros(len(pixels), bool)
-        for name, dtype in _TYPES.items():
-            setattr(self, name, None if name in _GLINTS and not world.has_glints else np.empty(0, dtype))
-        self._reserve(len(pixels) * grid * grid * 3 // 2)
+        rows = np.empty((0, 4), np.float32)
+        self.table = Table(rows.astype(np.int32), np.empty((0, 8), np.float32), rows if world.has_glints else None)
+        self.child = np.empty(0, np.int32)
+        for name in _COLUMNS:
+            setattr(self, name, np.empty(0, np.float32))
         cell_row, cell_column = np.divmod(np.arange(grid * grid, dtype=np.int32), grid)
         pixel_row, pixel_column = np.divmod(pixels.astype(np.int32), self.width)
-        column = (pixel_column[:, None] * grid + cell_column).ravel()
-        row = (pixel_row[:, None] * grid + cell_row).ravel()
-        self._add(np.repeat(np.arange(len(pixels), dtype=np.int32), grid * grid), column, row, 0)
+        place = np.empty((len(pixels), grid * grid, 4), np.int32)
+        place[..., PIXEL], place[..., LEVEL] = pixels[:, None], 0
+        place[..., COLUMN] = pixel_column[:, None] * grid + cell_column
+        place[..., ROW] = pixel_row[:, None] * grid + cell_row
+        self._first_cells = self._add(place.reshape(-1, 4))
 
     def refine(self, levels: int, edge_threshold: float) -> np.ndarray:
         """Cut cells until none needs it or is `levels` deep; whether a cell of each pixel was, (pixels,) bool.
@@ -82,7 +91,7 @@ class CellTree:
         touched = np.zeros(len(self.pixels), bool)
         if len(self.pixels) == 0:
             return touched
-        per_pixel = self.radiance[: self.used].reshape(len(self.pixels), -1).mean(axis=1, dtype=np.float64)
+        per_pixel = self.energy[: self.used].reshape(len(self.pixels), -1).sum(axis=1, dtype=np.float64)
         self.least = np.float32(edge_threshold * np.sqrt(np.square(per_pixel).mean()))
         pending = self._first_cuts()
         if levels == 0:
@@ -91,89 +100,88 @@ class CellTree:
         for _ in range(MAX_LAUNCHES):
             if len(pending) <= few:
                 break
-            touched[self.rank[pending]] = True
+            touched[self.rank(pending)] = True
             pending = self._cut(pending, levels)
         return touched
 
     def clip(self) -> int:
         """Clip the leaves that are still not small to their faces; the number that this changes."""
-        large = _having(self.flags[: self.used], LARGE)
+        flags = self.table.surface.view(np.uint32)[: self.used, FLAGS]
+        large = np.flatnonzero((flags & LARGE) != 0)  # by way of booleans, of which numpy skips those that are false
         large = large[self.child[large] < 0]
-        found = self._trace(large, clip=True)
+        if len(large) == 0:
+            return 0
+        found = self._trace(self.table.place[large], clip=True)
         self.path_m[large], self.half_width_m[large] = found.path_m, found.half_width_m
         return int(np.count_nonzero(found.flags & CLIPPED))
 
-    def pitch(self, index: np.ndarray | slice) -> np.ndarray:
-        """Return width of cells in pixels, float32."""
-        return np.ldexp(np.float32(1 / self.grid), -self.level[index])
+    def rank(self, cells: np.ndarray) -> np.ndarray:
+        """Look up the place in `pixels` of cells' pixels."""
+        return self.rank_of[self.table.place[cells, PIXEL] - self.first]
 
-    def _trace(self, index: np.ndarray | slice, *, clip: bool = False) -> Footprints:
-        column, row, level = self.column[index], self.row[index], self.level[index]
-        self.rays += len(column)
-        return trace(self.world, column, row, level, self.grid, clip=clip)
+    def _trace(self, place: np.ndarray, *, clip: bool = False) -> Footprints:
+        self.rays += len(place)
+        return trace(self.world, place[:, COLUMN], place[:, ROW], place[:, LEVEL], self.grid, clip=clip)
 
-    def _add(self, rank: np.ndarray, column: np.ndarray, row: np.ndarray, level: np.ndarray | int) -> slice:
+    def _add(self, place: np.ndarray) -> Footprints:
         """Trace new cells and append them."""
-        new = slice(self.used, self.used + len(rank))
-        if new.stop > len(self.rank):
+        found = self._trace(place)
+        new = slice(self.used, self.used + len(place))
+        if new.stop > len(self.child):
             self._reserve(new.stop + new.stop // 2)
-        self.rank[new], self.column[new], self.row[new], self.level[new], self.child[new] = rank, column, row, level, -1
-        for name, values in self._trace(new)._asdict().items():
-            if values is not None:
-                getattr(self, name)[new] = values
+        self.child[new], self.table.place[new] = -1, place
+        for name in _COLUMNS:
+            getattr(self, name)[new] = getattr(found, name)
+        for part, names in ((self.table.surface, SURFACE), (self.table.highlight, HIGHLIGHT)):
+            if part is not None:
+                for number, name in enumerate(names):
+                    part[new, number] = getattr(found, name).view(np.float32)
         self.used = new.stop
-        return new
+        return found
 
     def _reserve(self, cells: int) -> None:
         """Make room for so many cells."""
-        for name, dtype in _TYPES.items():
-            old = getattr(self, name)
-            if old is None:
-                continue
-            grown = aligned(cells, dtype)
-            grown[: self.used] = old[: self.used]
-            setattr(self, name, grown)
+        for name in ("child", *_COLUMNS):
+            setattr(self, name, _grown(getattr(self, name), self.used, cells))
+        place, surface, highlight = self.table
+        highlight = None if highlight is None else _grown(highlight, self.used, cells)
+        self.table = Table(_grown(place, self.used, cells), _grown(surface, self.used, cells), highlight)
 
     def _first_cuts(self) -> np.ndarray:
         """Compare the cells of level 0, which then follow their neighbours: those to cut, sorted."""
-        path_intervals = [interval[: self.used] for interval in (self.path_m, self.half_width_m, self.minor_m)]
-        columns = (getattr(self, name) for name in Cells._fields)
-        cells = Cells(*(None if column is None else column[: self.used] for column in columns))
+        found = self._first_cells
+        del self._first_cells  # their memory is needed no more
+        cells = Cells(*(getattr(found, name) for name in Cells._fields))
         of_image = self.width if self.whole_rows else 0
-        bits, *found = first_edges(cells, path_intervals, self.grid, of_image, float(self.least))
-        for interval, new in zip(path_intervals, found, strict=True):
-            interval[:] = new
+        intervals = found.path_m, found.half_width_m, found.minor_m
+        bits, *spans = first_edges(cells, intervals, self.grid, of_image, float(self.least))
+        for name, values in zip(_SPANS, spans, strict=True):
+            getattr(self, name)[: self.used] = values
         return self._note(bits)[0]
 
     def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
         """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""
-        start = self.used
-        child = np.arange(start, start + 4 * len(parents), 4, dtype=np.int32)
-        self.child[parents] = child
-        self._add(
-            np.repeat(self.rank[parents], 4),
-            (2 * self.column[parents, None] + _CHILD_COLUMN).ravel(),
-            (2 * self.row[parents, None] + _CHILD_ROW).ravel(),
-            np.repeat(self.level[parents] + 1, 4),
-        )
-        places = Place(*(getattr(self, name) for name in Place._fields))
-        cells = Cells(*(getattr(self, name) for name in Cells._fields))
+        self.child[parents] = np.arange(self.used, self.used + 4 * len(parents), 4, dtype=np.int32)
+        doubled = self.table.place[parents] * np.array([1, 1, 2, 2], np.int32)
+        place = np.repeat(doubled, 4, axis=0).reshape(-1, *_CHILDREN.shape) + _CHILDREN
+        self._add(place.reshape(-1, 4))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
-        bits = child_edges(tree, places, cells, parents, float(self.least))[: self.used]
+        bits = child_edges(tree, self.table, parents, float(self.least))[: self.used]
         marked, why = self._note(bits)
         deepest = np.where(why & GLINT, levels + GLINT_LEVELS, levels)
-        return marked[(self.child[marked] < 0) & (self.level[marked] < deepest)]
+        return marked[(self.child[marked] < 0) & (self.table.place[marked, LEVEL] < deepest)]
 
     def _note(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Note which pixels are mixed; return the cells to cut, sorted, and their bits."""
         cells = np.flatnonzero(bits != 0)  # most have none, and one pass over all is enough
         found = bits[cells]
-        self.mixed[self.rank[cells[(found & MIXED) != 0]]] = True
+        self.mixed[self.rank(cells[(found & MIXED) != 0])] = True
         cut = (found & (CUT | GLINT)) != 0
         return cells[cut], found[cut]
 
 
-def _having(bits: np.ndarray, wanted: int) -> np.ndarray:
-    """Find the indices at which one of the `wanted` bits is set. By way of booleans, of which numpy skips those that
-    are false fast."""
-    return np.flatnonzero((bits & wanted) != 0)
+def _grown(old: np.ndarray, used: int, rows: int) -> np.ndarray:
+    """Return the `used` first rows of an array in aligned memory with room for `rows`."""
+    grown = aligned(rows * math.prod(old.shape[1:]), old.dtype.type).reshape(rows, *old.shape[1:])
+    grown[:used] = old[:used]
+    return grown

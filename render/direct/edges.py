@@ -28,6 +28,8 @@ FOLLOWED = 3e-4
 GLINT_WIDTH = 2.0  # of a highlight, in units of the roughness
 
 CUT, MIXED, GLINT = 1, 2, 4
+SURFACE = ("distance_m", "slope_x_m", "slope_y_m", "radiance", "facing", "flags")
+HIGHLIGHT = ("tilt_x", "tilt_y", "peak")
 SIDES = 4  # of a cut cell: at each two children meet one another and what lies beyond
 
 
@@ -37,8 +39,8 @@ class Cells(NamedTuple):
     distance_m: Floats
     slope_x_m: Floats
     slope_y_m: Floats
-    facing: Floats
     radiance: Floats
+    facing: Floats
     flags: UInts
     tilt_x: Floats = None
     tilt_y: Floats = None
@@ -46,12 +48,25 @@ class Cells(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Positions of cells: level, column and row in cells of that level, and the rank of their pixel, (N,) each."""
+    """Positions of cells: the flat index of their pixel, their level, and column and row in cells of that level."""
 
+    pixel: UInts
     level: UInts
     column: UInts
     row: UInts
-    rank: UInts
+
+
+class Table(NamedTuple):
+    """Cells by row: children are compared with cells from all over a tree, and a row lies in one place in memory.
+
+    place      (N, 4) int32: `Place`
+    surface    (N, 8) float32: SURFACE, the flags by their bits, and two spare columns
+    highlight  (N, 4) float32: HIGHLIGHT and a spare column, in worlds with glints
+    """
+
+    place: np.ndarray
+    surface: np.ndarray
+    highlight: np.ndarray | None
 
 
 class Tree(NamedTuple):
@@ -106,7 +121,7 @@ def first_edges(
     return tuple(values.numpy() for values in found)
 
 
-def child_edges(tree: Tree, places: Place, cells: Cells, parents: np.ndarray, least: float) -> np.ndarray:
+def child_edges(tree: Tree, table: Table, parents: np.ndarray, least: float) -> np.ndarray:
     """Compare the children of cells that were just cut with each other and with what lies beyond the cut cells' sides:
     a child of a cell of the same size, or a leaf.
 
@@ -117,12 +132,11 @@ def child_edges(tree: Tree, places: Place, cells: Cells, parents: np.ndarray, le
     lane = dr.arange(UInt32, SIDES * number)
     dr.eval(lane)
     counts = tuple(dr.opaque(UInt32, value) for value in (tree.grid, tree.width, tree.first, len(tree.rank_of)))
-    bits = dr.zeros(UInt32, len(cells.flags))
+    bits = dr.zeros(UInt32, len(tree.child))
     dr.eval(bits)
     found = _child_edges(
         tuple(mi.Int32(column) for column in (tree.rank_of, tree.child)),
-        tuple(UInt32(column.view(np.uint32)) for column in places),
-        _seen(cells),
+        (UInt32(table.place.view(np.uint32).ravel()), *(Float(part.ravel()) for part in table[1:] if part is not None)),
         (lane, upload(UInt32, parents, number)),
         counts,
         dr.opaque(Float, float(least)),
@@ -195,15 +209,12 @@ def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple
 
 
 @recorded
-def _child_edges(
-    tree: tuple, places: tuple, cells: tuple, sides: tuple, counts: tuple, least: Floats, bits: UInts
-) -> UInts:
+def _child_edges(tree: tuple, table: tuple, sides: tuple, counts: tuple, least: Floats, bits: UInts) -> UInts:
     (rank_of, child), (lane, parent), (grid, width, first, pixels) = tree, sides, counts
-    places, cells = Place(*places), Cells(*cells)
     side = lane & (SIDES - 1)  # left, right, above, below
     beyond, upright = side & 1, side < 2  # whether the way leads to higher columns or rows; along the columns
     of = dr.gather(UInt32, parent, lane // SIDES)
-    level, column, row, rank = (dr.gather(UInt32, numbers, of) for numbers in places)
+    pixel, level, column, row = dr.gather(mi.Vector4u, table[0], of)
     way = 2 * mi.Int32(beyond) - 1
     way_x, way_y = dr.select(upright, way, 0), dr.select(upright, 0, way)
     there = mi.Int32(column) + way_x, mi.Int32(row) + way_y
@@ -217,8 +228,8 @@ def _child_edges(
     far = dr.select(cut, UInt32(its_child) + dr.select(upright, 1 - beyond, 2 * (1 - beyond)), found.cell)
     one = near, near + next_one
     other = far, dr.select(cut, far + next_one, far)
-    here = tuple(_at(cells, index) for index in one)
-    beside = tuple(_at(cells, index, found.exists) for index in other)
+    here = tuple(_row(table, index) for index in one)
+    beside = tuple(_row(table, index, found.exists) for index in other)
     # ways between centres, in halves of a child's width
     below = level - found.level
     leaf_x, leaf_y = (((2 * (to >> mi.Int32(below)) + 1) << mi.Int32(below + 1)) for to in there)
@@ -230,7 +241,9 @@ def _child_edges(
         x = 4 * mi.Int32(column) + 1 + dr.select(upright, 2 * mi.Int32(beyond), 2 * i)
         y = 4 * mi.Int32(row) + 1 + dr.select(upright, 2 * i, 2 * mi.Int32(beyond))
         to_x, to_y = dr.select(cut, 2 * way_x, leaf_x - x), dr.select(cut, 2 * way_y, leaf_y - y)
-        between = _compared(here[i], beside[i], Float(to_x) * half, Float(to_y) * half, wide, rank == found.rank, least)
+        between = _compared(
+            here[i], beside[i], Float(to_x) * half, Float(to_y) * half, wide, pixel == found.pixel, least
+        )
         between = dr.select(found.exists, between, 0)
         marks[i] |= between
         dr.scatter_reduce(dr.ReduceOp.Or, bits, between, other[i], between != 0, dr.ReduceMode.Direct)
@@ -242,12 +255,12 @@ def _child_edges(
 
 
 class _Found(NamedTuple):
-    """Cell that was looked up: whether there is one, its number, level, and the rank of its pixel."""
+    """Cell that was looked up: whether there is one, its number, level, and the flat index of its pixel."""
 
     exists: Masks
     cell: UInts
     level: UInts
-    rank: UInts
+    pixel: UInts
 
 
 @dr.syntax
@@ -273,7 +286,7 @@ def _cell_at(tree: tuple, level: UInts, column: UInts, row: UInts) -> _Found:
         found = dr.select(below >= 0, down, found)
         reached = dr.select(below >= 0, reached + 1, reached)
         depth = dr.select(below >= 0, depth, 0)
-    return _Found(exists, UInt32(found), UInt32(reached), UInt32(rank))
+    return _Found(exists, UInt32(found), UInt32(reached), place + first)
 
 
 def _compared(
@@ -313,6 +326,17 @@ def _at(columns: Array, index: UInts, active: bool | Masks = True) -> Array:
     """Gather the columns of the cells `index`; zeros where not `active`."""
     gathered = (dr.gather(type(column), column, index, active) for column in columns if column is not None)
     return type(columns)(*gathered)
+
+
+def _row(table: Array, index: UInts, active: bool | Masks = True) -> Cells:
+    """Gather the cells `index` from a table; zeros where not `active`."""
+    near, far = (dr.gather(mi.Vector4f, table[1], 2 * index + half, active) for half in range(2))
+    distance, slope_x, slope_y, radiance = near
+    cells = Cells(distance, slope_x, slope_y, radiance, far.x, dr.reinterpret_array(UInt32, far.y))
+    if len(table) == 2:
+        return cells
+    tilt_x, tilt_y, peak, _ = dr.gather(mi.Vector4f, table[2], index, active)
+    return cells._replace(tilt_x=tilt_x, tilt_y=tilt_y, peak=peak)
 
 
 def _between(one: Cells, other: Cells, step: UInts, rise: Floats, other_rise: Floats) -> _Between:

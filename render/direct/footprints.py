@@ -32,9 +32,9 @@ FINE = 8  # rows a pixel, from which on rays in the middle do as well where noth
 
 
 class Footprints(NamedTuple):
-    """Per cell, float32 (N,): path centre, half width, smaller half span b [m] (0: unknown), radiance, radial
-    distance of the centre [m], its change per pixel along x and y [m], |cosine| of the shading normal and the way to
-    the laser, and flags HIT, LIT, LARGE, CLIPPED (uint32).
+    """Per cell, float32 (N,): path centre, half width, smaller half span b [m] (0: unknown), energy (radiance times the
+    cell's share of its pixel), radial distance of the centre [m], its change per pixel along x and y [m], radiance,
+    |cosine| of the shading normal and the way to the laser, and flags HIT, LIT, LARGE, CLIPPED (uint32).
 
     Of worlds with glints also how far the shading normal is from the middle of the highlight, n - h with h halfway
     between the ways to camera and laser, in camera-frame x and y over the surface's roughness; and the radiance in
@@ -43,10 +43,11 @@ class Footprints(NamedTuple):
     path_m: np.ndarray
     half_width_m: np.ndarray
     minor_m: np.ndarray
-    radiance: np.ndarray
+    energy: np.ndarray
     distance_m: np.ndarray
     slope_x_m: np.ndarray
     slope_y_m: np.ndarray
+    radiance: np.ndarray
     facing: np.ndarray
     flags: np.ndarray
     tilt_x: np.ndarray | None = None
@@ -63,7 +64,7 @@ def trace(
     """
     if len(column) == 0:
         nothing = np.empty(0, np.float32)
-        return Footprints(*(nothing,) * 8, np.empty(0, np.uint32), *(nothing,) * (3 if world.has_glints else 0))
+        return Footprints(*(nothing,) * 9, np.empty(0, np.uint32), *(nothing,) * (3 if world.has_glints else 0))
     packed = row.astype(np.uint32) | level.astype(np.uint32) << LEVEL_BIT
     count, lanes = len(column), _lanes(len(column))
     columns = [upload(UInt32, values, lanes) for values in (column, packed)]
@@ -151,10 +152,11 @@ def _footprints(world: TracedScene, column: UInts, packed: UInts, grid: UInts, *
         dr.select(hit, path, zero),
         dr.select(hit, half, zero),
         dr.select(small, dr.minimum(half_x, half_y), zero),
-        radiance,
+        radiance * dr.square(pitch),
         dr.select(hit, distance, zero),
         dr.select(hit, slope.x * per_pixel, zero),
         dr.select(hit, slope.y * per_pixel, zero),
+        radiance,
         dr.select(hit, facing, zero),
         flags,
         *(_glint(world, si, ray, to_laser, hit, irradiance * transmission) if world.has_glints else ()),
@@ -193,10 +195,11 @@ def _refracted_footprints(world: TracedScene, column: UInts, packed: UInts, grid
         2 * optical,
         half,
         dr.select(small, dr.minimum(half_x, half_y), 0),
-        radiance,
+        radiance * dr.square(pitch),
         optical,
         slope.x * per_pixel,
         slope.y * per_pixel,
+        radiance,
         dr.abs(dr.dot(si.sh_frame.n, bent.direction)),
     )
     glints: tuple = ()

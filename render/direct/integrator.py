@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, UInts
-from render.direct.cell_tree import MAX_CELLS, CellTree
+from render.direct.cell_tree import MAX_CELLS, PIXEL, CellTree
 from render.direct.footprints import albedo
 from render.scene.rays import camera_rays, first_opaque
 from render.scene.refraction import refracted_hit
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr
-from render.transient.samples import Samples, concatenate, merge, no_samples, packed
+from render.transient.samples import Samples, concatenate, merge, no_samples, packed, with_energy
 
 RAYS_PER_LAUNCH, MIN_ROWS = 1 << 19, 16
 REFINE = 6
@@ -94,32 +94,35 @@ def _chunk(
     tree = CellTree(world, pixels, grid)
     touched = tree.refine(max(0, min(refine, math.ceil(math.log2(MAX_CELLS / grid)))), edge_threshold / grid**2)
     clipped = tree.clip()
+    leaves = tree.child[: tree.used] < 0
+    if tolerance_m == 0:
+        samples = with_energy(_samples(tree, np.flatnonzero(leaves), tolerance_m))
+        return DirectLight(samples, tree.mixed, clipped, tree.rays)
     # pixels that were left alone are a table of equal cells; what was cut is a list
     plain = _merge_plain(tree, np.flatnonzero(~touched), tolerance_m)
-    leaves = tree.child[: tree.used] < 0
     leaves[: len(pixels) * grid * grid] &= np.repeat(touched, grid * grid)
     cells = np.flatnonzero(leaves)
-    cut = merge(_samples(tree, cells, tree.pitch(cells), tolerance_m), tolerance_m)
+    cut = merge(_samples(tree, cells, tolerance_m), tolerance_m)
     return DirectLight(concatenate([plain, cut]), tree.mixed, clipped, tree.rays)
 
 
-def _samples(tree: CellTree, cells: np.ndarray, pitch: np.ndarray | float, tolerance_m: float) -> Samples:
-    """Make the returns of `cells` that are `pitch` pixels wide.
+def _samples(tree: CellTree, cells: np.ndarray, tolerance_m: float) -> Samples:
+    """Make the returns of `cells`.
 
     A cell with half spans a > b is a trapezoid of path lengths, which one uniform return describes badly at the edges
     of bins. Where b is above the tolerance two returns do it better, without another ray: its halves along the smaller
     span, at p +- b/2 with half width sqrt(a^2 + b^2 / 4).
     """
     count = len(cells)
-    wide = np.flatnonzero(tree.minor_m[cells] > max(tolerance_m, NARROW_M))
+    minor = tree.minor_m[cells]
+    wide = np.flatnonzero(minor > max(tolerance_m, NARROW_M))
     found = no_samples(count + len(wide))
     pixel, path, half_width, radiance, _ = found
-    pixel[:count] = tree.pixels[tree.rank[cells]]
-    for column, values in ((path, tree.path_m), (half_width, tree.half_width_m), (radiance, tree.radiance)):
+    columns = tree.table.place[:, PIXEL], tree.path_m, tree.half_width_m, tree.energy
+    for column, values in zip(found, columns, strict=False):
         np.take(values, cells, out=column[:count], mode="clip")  # other modes copy once more
-    radiance[:count] *= np.square(pitch, dtype=np.float32)
     found.bounces[:] = 1
-    minor = tree.minor_m[cells[wide]]
+    minor = minor[wide]
     pixel[count:] = pixel[wide]
     radiance[wide] = radiance[count:] = radiance[wide] / 2
     half_width[wide] = half_width[count:] = np.sqrt(half_width[wide] ** 2 - 0.75 * minor**2)
@@ -135,24 +138,23 @@ def _merge_plain(tree: CellTree, ranks: np.ndarray, tolerance_m: float) -> Sampl
     """
     cells = tree.grid**2
     index = ranks[:, None] * cells + np.arange(cells)
-    fraction = 1 / cells
-    if cells > 64 or tolerance_m == 0:
-        return merge(_samples(tree, index.ravel(), 1 / tree.grid, tolerance_m), tolerance_m)
-    radiance = tree.radiance[index]
-    lit = radiance > 0
+    if cells > 64:
+        return merge(_samples(tree, index.ravel(), tolerance_m), tolerance_m)
+    energy = tree.energy[index]
+    lit = energy > 0
     key = np.floor(tree.path_m[index] / tolerance_m)
     columns = [key[:, k] for k in range(cells)]
     same = _all([columns[0] == column for column in columns[1:]], len(ranks)) & _all(list(lit.T), len(ranks))
-    parts = [_merge_rows(tree, index[same], radiance[same], fraction)]
+    parts = [_merge_rows(tree, index[same], energy[same])]
     rest = index[~same]
     if cells == 1:
         return parts[0]
     if cells <= 4:
         pairs = [columns[i] != columns[j] for i in range(cells) for j in range(i)]
         apart = _all(pairs, len(ranks)) & _all(list(lit.T), len(ranks))
-        parts.append(_samples(tree, index[apart].ravel(), 1 / tree.grid, tolerance_m))
+        parts.append(_samples(tree, index[apart].ravel(), tolerance_m))
         rest = index[~(same | apart)]
-    parts.append(merge(_samples(tree, rest.ravel(), 1 / tree.grid, tolerance_m), tolerance_m))
+    parts.append(merge(_samples(tree, rest.ravel(), tolerance_m), tolerance_m))
     return concatenate(parts)
 
 
@@ -164,15 +166,15 @@ def _all(conditions: list[np.ndarray], length: int) -> np.ndarray:
     return every
 
 
-def _merge_rows(tree: CellTree, index: np.ndarray, radiance: np.ndarray, fraction: float) -> Samples:
+def _merge_rows(tree: CellTree, index: np.ndarray, energy: np.ndarray) -> Samples:
     """Make one return for each row of cells, with the sum of energy, the centroid and the variance of its cells."""
-    weight = radiance.astype(np.float64).T * fraction
+    weight = energy.astype(np.float64).T
     path = tree.path_m[index].astype(np.float64).T
     half_width = tree.half_width_m[index].astype(np.float64).T
     total: np.ndarray = sum(weight)  # type: ignore[assignment]  # of arrays: one after the other
     centroid = sum(weight * path) / total if len(total) else total
     variance = sum(weight * ((path - centroid) ** 2 + half_width**2 / 3)) / total if len(total) else total
-    pixel = tree.pixels[tree.rank[index[:, 0]]]
+    pixel = tree.table.place[index[:, 0], PIXEL]
     return packed(pixel, centroid, np.sqrt(3 * variance), total, np.ones(len(index), np.uint8))
 
 

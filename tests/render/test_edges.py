@@ -12,17 +12,21 @@ from render.direct.edges import (
     FOLLOWED,
     GLINT,
     GLINT_WIDTH,
+    HIGHLIGHT,
     MIXED,
     MIXED_GAP_M,
     STEP_M,
+    SURFACE,
     TONE,
     Cells,
     Place,
+    Table,
     Tree,
     child_edges,
     first_edges,
 )
 from render.direct.footprints import HIT, LARGE, LIT
+from render.scene.traced_scene import aligned
 
 HEIGHT, WIDTH, GRID, LEAST = 8, 9, 3, 0.02
 COUNT = HEIGHT * WIDTH * GRID**2
@@ -37,8 +41,8 @@ def cells_of(seed: int, count: int = COUNT, *, glossy: bool = False) -> Cells:
         np.where(hit, draw.choice([2.0] * 7 + [2.0005, 2.001, 2.04, 2.5], count), 0).astype(np.float32),
         np.where(hit, draw.choice([0.0] * 5 + [0.001, 0.02, 0.2], count), 0).astype(np.float32),
         np.where(hit, draw.choice([0.0] * 5 + [-0.001, 0.01], count), 0).astype(np.float32),
-        np.where(hit, draw.choice([0.8, 0.82, 0.9], count), 0).astype(np.float32),
         np.where((flags & LIT) != 0, draw.choice([0.2, 0.21, 0.5], count), 0).astype(np.float32),
+        np.where(hit, draw.choice([0.8, 0.82, 0.9], count), 0).astype(np.float32),
         flags.astype(np.uint32),
         *(draw.choice(some, count).astype(np.float32) for some in ([-3, 0.2, 5], [-2, 0, 9], [0, 2, 20]) if glossy),
     )
@@ -140,8 +144,8 @@ def test_children_are_compared_with_all_that_lies_beside_them(cut_before: int, g
     rank_of = np.full(48 - first, -1, np.int32)
     rank_of[pixels - first] = np.arange(len(pixels))
     places = [
-        (0, grid * (pixel % width) + i % grid, grid * (pixel // width) + i // grid, rank)
-        for rank, pixel in enumerate(pixels)
+        Place(pixel, 0, grid * (pixel % width) + i % grid, grid * (pixel // width) + i // grid)
+        for pixel in pixels
         for i in range(grid**2)
     ]
     child = np.full(4000, -1, np.int32)
@@ -149,33 +153,43 @@ def test_children_are_compared_with_all_that_lies_beside_them(cut_before: int, g
         start = len(places)
         parents = np.sort(draw.choice(np.flatnonzero(child[:start] < 0), start // 3, replace=False))
         child[parents] = start + 4 * np.arange(len(parents))
-        for level, column, row, rank in [places[parent] for parent in parents]:
-            places += [(level + 1, 2 * column + i % 2, 2 * row + i // 2, rank) for i in range(4)]
+        for pixel, level, column, row in [places[parent] for parent in parents]:
+            places += [Place(pixel, level + 1, 2 * column + i % 2, 2 * row + i // 2) for i in range(4)]
     count = len(places)
     cells = cells_of(cut_before, count, glossy=glossy)
-    where = {place[:3]: number for number, place in enumerate(places)}
+    where = {place[1:]: number for number, place in enumerate(places)}
     expected = np.where(cells.flags & LARGE, CUT, 0)
     expected[:start] = 0
     for number in range(start, count):
-        level, column, row, rank = places[number]
+        _, level, column, row = places[number]
         for way_x, way_y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
             above = ((up, (column + way_x) >> level - up, (row + way_y) >> level - up) for up in range(level, -1, -1))
             beside = next((where[place] for place in above if place in where), None)
             if beside is not None:
                 bits = bits_of_pair(cells, (number, beside), [places[number], places[beside]], grid)
                 expected[[number, beside]] |= bits
-    columns = Place(*np.array(places, np.int32).T.copy())
-    bits = child_edges(Tree(grid, width, first, rank_of, child[:count]), columns, cells, parents, LEAST)
+    bits = child_edges(Tree(grid, width, first, rank_of, child[:count]), table_of(places, cells), parents, LEAST)
     assert np.array_equal(bits, expected)
     assert all(20 < np.count_nonzero(bits & bit) < count - 20 for bit in (CUT, MIXED, GLINT)[: 2 + glossy])
 
 
-def bits_of_pair(cells: Cells, pair: tuple[int, int], places: list[tuple[int, int, int, int]], grid: int) -> int:
-    """CUT, MIXED and GLINT of two cells at (level, column, row, rank), a sentence of `render.direct.edges` a line."""
-    widths = [1 / (grid * 2**level) for level, *_ in places]
-    centres = [((x + 0.5) * w, (y + 0.5) * w) for (_, x, y, _), w in zip(places, widths, strict=True)]
+def table_of(places: list[Place], cells: Cells) -> Table:
+    """Pack cells by row."""
+    parts = [(4, np.int32), (8, np.float32), *([] if cells.peak is None else [(4, np.float32)])]
+    rows = [aligned(len(places) * width, kind).reshape(-1, width) for width, kind in parts]
+    rows[0][:] = places
+    for part, names in zip(rows[1:], (SURFACE, HIGHLIGHT), strict=False):
+        for number, name in enumerate(names):
+            part[:, number] = getattr(cells, name).view(np.float32)
+    return Table(rows[0], rows[1], None if cells.peak is None else rows[2])
+
+
+def bits_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid: int) -> int:
+    """CUT, MIXED and GLINT of two cells at these places, a sentence of `render.direct.edges` a line."""
+    widths = [1 / (grid * 2**place.level) for place in places]
+    centres = [((place.column + 0.5) * w, (place.row + 0.5) * w) for place, w in zip(places, widths, strict=True)]
     differ, apart, contrast, _, glint = between(cells, *pair, tuple(np.subtract(centres[1], centres[0])))
-    energy, of_one_pixel = max(cells.radiance[list(pair)]) * max(widths) ** 2, places[0][3] == places[1][3]
+    energy, of_one_pixel = max(cells.radiance[list(pair)]) * max(widths) ** 2, places[0].pixel == places[1].pixel
     cut, shining = differ and energy * contrast >= LEAST, glint > 0 and glint * max(widths) ** 2 >= LEAST
     return CUT * cut | MIXED * (differ and apart and of_one_pixel) | GLINT * shining
 

@@ -17,19 +17,21 @@ def binned(samples: Samples, pixels: int, bins: int, bin_m: float) -> np.ndarray
     """
     if len(samples.pixel) == 0:
         return np.zeros((pixels, bins), np.float32)
-    # a point on an edge belongs to the bin above it: the division must not round it down
-    near = ((samples.path_m - samples.half_width_m) / bin_m).astype(np.float32)
-    far = ((samples.path_m + samples.half_width_m) / bin_m).astype(np.float32)
-    columns = upload(UInt32, samples.pixel), upload(Float, near), upload(Float, far), upload(Float, samples.radiance)
-    out = _scattered(*columns, dr.opaque(UInt32, bins), pixels * bins)
+    intervals = (upload(Float, values) for values in (samples.path_m, samples.half_width_m, samples.radiance))
+    numbers = dr.opaque(UInt32, bins), dr.opaque(Float, bin_m)
+    out = _scattered(upload(UInt32, samples.pixel), *intervals, *numbers, pixels * bins)
     dr.eval(out)
     return out.numpy().reshape(pixels, bins)
 
 
 @dr.freeze
 @dr.syntax
-def _scattered(pixel: UInts, near: Floats, far: Floats, radiance: Floats, bins: UInts, size: int) -> Floats:
+def _scattered(
+    pixel: UInts, path: Floats, half_width: Floats, radiance: Floats, bins: UInts, bin_m: Floats, size: int
+) -> Floats:
     out = dr.zeros(Float, size)
+    # a point on an edge belongs to the bin above it: the division must not round it down
+    near, far = (path - half_width) / bin_m, (path + half_width) / bin_m
     place = dr.maximum(mi.Int32(dr.floor(near)), 0)
     last = dr.minimum(mi.Int32(dr.floor(far)), mi.Int32(bins) - 1)
     point = far == near
