@@ -85,7 +85,7 @@ def _brightest_lit(world: TracedScene) -> float:
     if world.scene.laser.mode != "flood":
         return 0.0
     key = dr.opaque(UInt32, 0), dr.opaque(UInt32, 1)
-    return float(sample_light_vertices(world, LIT_LANES, 1, key).irradiance.numpy().max()) / math.pi
+    return float(sample_light_vertices(world, LIT_LANES, 1, key).all().irradiance.numpy().max()) / math.pi
 
 
 def mean_path(samples: Samples, pixels: int) -> tuple[np.ndarray, float]:

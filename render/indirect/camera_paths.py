@@ -100,7 +100,7 @@ def trace_paths(task: PathTask) -> PathBatch:
         upload(UInt32, np.append(pixels.astype(np.int64) & 0xFFFFFFFF, 0)),
         tuple(dr.opaque(UInt32, int(number)) for number in seeds[:2]),
         dr.opaque(UInt32, batches),
-        None if light_vertices is None else (parts_of(light_vertices.si), *light_vertices[1:]),
+        None if light_vertices is None else tuple(light_vertices),
         from_m,
     )
     work = partial(_paths, reuses_paths=reuses_paths, connections=connections, members=members)
@@ -146,11 +146,7 @@ def _paths(
     """Trace the parts of `PathBatch`, in plain tuples, which recordings look into."""
     given = _Given(*given)
     slots, keys, from_m = Slots(*given.slots), given.keys, given.from_m
-    light_vertices = (
-        None
-        if given.light_vertices is None
-        else LightVertices(interaction_from_parts(given.light_vertices[0]), *given.light_vertices[1:])
-    )
+    light_vertices = None if given.light_vertices is None else LightVertices(*given.light_vertices)
     row, member = slots.lane // members, slots.lane % members
     block, stream, sample_index, per_batch = (dr.gather(UInt32, given.launch, 4 * row + part) for part in range(4))
     batch, order = sample_order(sample_index, given.batches, per_batch)

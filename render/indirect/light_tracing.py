@@ -17,7 +17,7 @@ product runs over x1 (in from the laser) to xk (out to the camera). c is the sha
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -81,8 +81,8 @@ def trace_light_paths(
         pixel = np.searchsorted(ends, lane, side="right")
         number = lane - (ends - counts)[pixel]
         batch = (number + pixel) % batches
-        columns = (upload(UInt32, column) for column in (pixel, lane, number // batches, batch))
-        found = _trace_launch(world, *columns, keys, bounces)
+        columns = [upload(UInt32, column) for column in (pixel, lane, number // batches, batch)]
+        found = _trace_launch(world, columns, keys, bounces)
         dr.eval(found)
         target, path, radiance = (values.numpy() for values in found)
         kept = np.flatnonzero(radiance)
@@ -90,15 +90,23 @@ def trace_light_paths(
         yield LightPathSplats(target[kept].astype(np.int64), path[kept], radiance, batch[kept % len(lane)])
 
 
-@dr.syntax
-def _trace_launch(
-    world: TracedScene, pixel: UInts, lane: UInts, number: UInts, batch: UInts, keys: list[Array], bounces: int
-) -> tuple[Array, Array, Array]:
+def _trace_launch(world: TracedScene, columns: Sequence[Array], keys: Sequence[Array], bounces: int) -> tuple:
     """Trace light paths; return target pixels, paths and radiances, (bounces - 1) x lanes flat."""
-    lanes = dr.width(lane)
+    lanes = dr.width(columns[0])
     targets = dr.zeros(UInt32, lanes * (bounces - 1))
     paths, values = dr.zeros(Float, lanes * (bounces - 1)), dr.zeros(Float, lanes * (bounces - 1))
-    place, stride, last = dr.arange(UInt32, lanes), dr.opaque(UInt32, lanes), dr.opaque(UInt32, bounces - 1)
+    dr.eval(targets, paths, values)
+    numbers = dr.opaque(UInt32, lanes), dr.opaque(UInt32, bounces - 1)
+    given = tuple(columns), tuple(keys), numbers, (targets, paths, values)
+    return world.recordings.call(world, ("light paths", bounces), _light_paths, *given)
+
+
+@dr.syntax
+def _light_paths(
+    world: TracedScene, columns: tuple, keys: tuple, numbers: tuple, found: tuple
+) -> tuple[Array, Array, Array]:
+    (pixel, lane, number, batch), (stride, last), (targets, paths, values) = columns, numbers, found
+    lanes, place = dr.width(lane), dr.arange(UInt32, dr.width(lane))
     key = mi.sample_tea_32(lane ^ keys[0], keys[1])
     random = mi.PCG32(initstate=mi.UInt64(key[0]), initseq=mi.UInt64(key[1]))
     si, path, sample, value, active = _sample_first_vertex(world, pixel, number, batch, keys, random)
@@ -146,7 +154,7 @@ def _trace_launch(
 
 
 def _sample_first_vertex(
-    world: TracedScene, pixel: UInts, number: UInts, batch: UInts, keys: list[Array], random: Generators
+    world: TracedScene, pixel: UInts, number: UInts, batch: UInts, keys: Sequence[Array], random: Generators
 ) -> tuple[Array, ...]:
     """Sample x1: the vertex, the path to it, a sample of where light goes from there, its value, and whether there is
     any."""

@@ -26,7 +26,6 @@ from render.indirect.glossy import finite_ratio, has_light_paths, ratio_at_laser
 from render.scene.rays import (
     TOUCHING,
     first_opaque,
-    gather_vector,
     interaction_from_parts,
     laser_light,
     parts_of,
@@ -35,6 +34,7 @@ from render.scene.rays import (
     spawn,
     to_world,
 )
+from render.scene.rows import PLACE_ON_SURFACE, WIDTH, gather_rows, packed
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 from scenes.model import Laser
 
@@ -73,18 +73,31 @@ def connects_suffixes(world: TracedScene) -> bool:
     return cos_half_angle <= 0 or (laser.mode == "flood" and is_narrow)
 
 
-class LightVertices(NamedTuple):
-    """Points of a launch, `each` for every batch: direction and optical path to the laser, irradiance, and density.
-
-    `density` is that of one point per area [1/m^2]. At the end are a few that belong to no batch.
-    """
+class LightVertex(NamedTuple):
+    """A lit point: direction and optical path to the laser, irradiance, and density of one point per area [1/m^2]."""
 
     si: Interactions
     to_laser: Vectors
     path: Floats
     irradiance: Floats
     density: Floats
+
+
+class LightVertices(NamedTuple):
+    """Points of a launch, by row, `each` for every batch; at the end are a few that belong to no batch."""
+
+    rows: tuple[Array, ...]
     each: UInts
+
+    def all(self) -> LightVertex:
+        """Read all points."""
+        return self.at(dr.arange(UInt32, dr.width(self.rows[0]) // WIDTH))
+
+    def at(self, index: UInts, active: bool | Masks = True) -> LightVertex:
+        """Read the points of these numbers."""
+        columns = gather_rows(self.rows, (*PLACE_ON_SURFACE, mi.Vector3f, Float, Float, Float), index, active)
+        parts, rest = columns[: len(PLACE_ON_SURFACE)], columns[len(PLACE_ON_SURFACE) :]
+        return LightVertex(interaction_from_parts(parts), *rest)
 
 
 class Connection(NamedTuple):
@@ -107,11 +120,11 @@ def sample_light_vertices(world: TracedScene, lanes: int, batches: int, key: tup
     index = dr.arange(UInt32, count + 3)  # of no other input's length (`render.indirect.camera_paths`)
     dr.eval(index)
     parts, *columns = world.recordings.call(world, "lit points", _sample_vertices, index, opaque, *key)
-    return LightVertices(interaction_from_parts(parts), *columns, opaque)  # type: ignore[call-arg]
+    return LightVertices(packed((*parts[:-1], *columns)), opaque)
 
 
 def _sample_vertices(world: TracedScene, index: UInts, each: UInts, *key: UInts) -> tuple[Array, ...]:
-    """Sample the parts of `LightVertices`, in plain tuples."""
+    """Sample the parts of `LightVertex`, in plain tuples."""
     # each batch has a randomised (0, 2)-sequence of its own
     shift = mi.sample_tea_32(index // each + key[0], index * 0 + key[1])
     number = index % each
@@ -245,8 +258,7 @@ def connect_to_light_vertex(
 ) -> Arrival:
     """Connect a surface to one light vertex. What it makes of the light is `light` times `value` over the densities of
     all techniques together: its `lobes` and light vertices."""
-    end = dr.gather(mi.SurfaceInteraction3f, light_vertices.si, point, active)
-    irradiance = dr.gather(Float, light_vertices.irradiance, point, active)
+    end, to_laser, laser_path, irradiance, density = light_vertices.at(point, active)
     offset = end.p - si.p
     distance2 = dr.squared_norm(offset)
     direction = offset * dr.rsqrt(distance2)
@@ -254,15 +266,13 @@ def connect_to_light_vertex(
     value, lobes = reflected(si, si.to_local(direction), active)
     active &= value > 0
     end.wi = end.to_local(-direction)
-    to_laser = gather_vector(light_vertices.to_laser, point, active)
     light = end.bsdf().eval(mi.BSDFContext(), end, end.to_local(to_laser), active)[0] * irradiance
     active &= light > 0
     passed, leg = segment(world, si, end.p, active, spread=False)
-    path = leg + dr.gather(Float, light_vertices.path, point, active)
-    density = lit_density(dr.gather(Float, light_vertices.density, point, active), distance2, dr.dot(end.n, direction))
+    density = lit_density(density, distance2, dr.dot(end.n, direction))
     ratio = ratio_at_laser(world, end, -direction, active) if has_light_paths(world) else None
     light = dr.select(active & dr.isfinite(light * passed), light * passed, 0)
-    return Arrival(light, path, direction, density, value, lobes, ratio)
+    return Arrival(light, leg + laser_path, direction, density, value, lobes, ratio)
 
 
 class JoinedVertex(NamedTuple):
@@ -309,17 +319,17 @@ class SeenVertex(NamedTuple):
     going: Masks
 
 
-def joined_factors(world: TracedScene, joined: tuple[Array, ...], suffix: UInts, seen: SeenVertex) -> JoinedFactors:
-    """Return the factors of suffixes, given the first four parts of `JoinedVertex`, for the pixels that have `seen` x2;
-    the value before division by a density."""
+def joined_factors(world: TracedScene, joined: tuple[Array, ...], seen: SeenVertex) -> JoinedFactors:
+    """Return the factors of suffixes, given the first four parts of their `JoinedVertex`, for the pixels that have
+    `seen` x2; the value before division by a density."""
     direction, density, onward_density, reflected = joined
     rough = seen.active & (dr.gather(Float, world.rough_lobes, shape_index(seen.si), seen.active) > 0)
-    towards = seen.si.to_local(gather_vector(direction, suffix, rough))
+    towards = seen.si.to_local(direction)
     value, lobes = reflect(seen.si, towards, rough)
-    value /= lobes + dr.gather(Float, density, suffix, rough)
-    value = seen.reach * dr.select(rough, value, dr.gather(Float, reflected, suffix, seen.active))
+    value /= lobes + density
+    value = seen.reach * dr.select(rough, value, reflected)
     turned = dr.select(rough, reversal(seen.si, towards, lobes, rough), 1) if seen.at_x1 is not None else None
-    weight = mis_weight_bsdf(seen.onward_density, dr.gather(Float, onward_density, suffix, seen.going))
+    weight = mis_weight_bsdf(seen.onward_density, onward_density)
     value = dr.select(seen.active & dr.isfinite(value), value, 0)
     return JoinedFactors(value, None if turned is None else finite_ratio(seen.at_x1 * turned), weight)
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
-from render.backend.drjit_types import Array, Floats, Masks, UInts, Vectors
+from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
 from render.indirect.accumulators import IndirectAccumulator
 from render.indirect.camera_paths import PathBatch
 from render.indirect.glossy import (
@@ -44,7 +44,8 @@ from render.indirect.light_vertices import (
 from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
 from render.indirect.primary_vertices import reuses_early_paths
 from render.indirect.retro_paths import has_retro_paths, retro_ratio
-from render.scene.rays import gather_vector, interaction_from_parts, parts_of, segment, spawn
+from render.scene.rays import interaction_from_parts, parts_of, segment, spawn
+from render.scene.rows import INTERACTION, PLACE_ON_SURFACE, gather_rows, packed
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 # Of one launch, 30 and 75 MB in its course; 40 MB more under a lamp, where x2 is joined.
@@ -134,23 +135,34 @@ def _early(paths: PathBatch) -> Array:
     return suffixes.reusable & (dr.block_reduce(dr.ReduceOp.Max, near, BLOCK) > 0)
 
 
-class _Ends(NamedTuple):
-    """Parts of primary vertices and suffixes that pairs of both need, as arrays and plain tuples, which recordings look
-    into: see `PrimaryVertices` and `PathSuffixes`."""
+class _Suffix(NamedTuple):
+    """What pairs need of a suffix: see `PathSuffixes`."""
 
-    si1: tuple
-    transmission: Floats
-    allows_reuse: Masks
-    si2: tuple
-    reusable: Masks
     own_transmission: Floats
     leg: Floats
     to_laser: Vectors
     irradiance: Floats
     onward: Masks
     onward_direction: Vectors
-    density: Floats
-    joined: tuple | None
+    reusable: Masks
+    density: Floats = None
+    joined: tuple | None = None
+
+
+# kinds of what follows an interaction in the rows of primary vertices (transmission, whether they allow reuse), and in
+# those of suffixes: parts of `_Suffix`, and of `JoinedVertex` where there is one
+_OF_VERTEX = (Float, Bool)
+_OF_SUFFIX = (Float, Float, mi.Vector3f, Float, Bool, mi.Vector3f, Bool)
+_OF_JOINED = (mi.Vector3f, Float, Float, Float)
+
+
+class _Kinds(NamedTuple):
+    """What recordings of pairs differ in: whether late light is filtered, whether there are light vertices, and whether
+    x2 is joined to them."""
+
+    filtered: bool
+    connected: bool
+    joined: bool
 
 
 class _Connections(NamedTuple):
@@ -169,13 +181,35 @@ class _Connections(NamedTuple):
     joined_density: Floats
 
 
-def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array, filtered: bool) -> tuple[Array, ...]:
+def _rows_of(paths: PathBatch, chosen: UInts | None) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return what pairs need of primary vertices and of the chosen suffixes, by row."""
+    primary, suffixes = paths.primary, paths.suffixes
+    columns = [getattr(suffixes, name) for name in _Suffix._fields[:-1]]
+    columns += [] if suffixes.joined is None else suffixes.joined[: len(_OF_JOINED)]
+    return (
+        packed((*parts_of(primary.si), primary.transmission, primary.allows_reuse)),
+        packed([part for part in (*parts_of(suffixes.si)[:-1], *columns) if part is not None], chosen),
+    )
+
+
+def _read_suffix(kinds: _Kinds, rows: tuple[Array, ...], group: UInts) -> tuple[Interactions, _Suffix]:
+    """Read x2 and what pairs need of a suffix."""
+    parts = PLACE_ON_SURFACE, _OF_SUFFIX, (Float,) if kinds.connected else (), _OF_JOINED if kinds.joined else ()
+    columns = iter(gather_rows(rows, [kind for part in parts for kind in part], group, True))
+    si, known, density, joined = ([next(columns) for _ in part] for part in parts)
+    of_suffix = _Suffix(*known)._replace(density=next(iter(density), None), joined=tuple(joined) or None)
+    return interaction_from_parts(si), of_suffix
+
+
+def _connect(
+    world: TracedScene, number: UInts, chosen: UInts, vertices: tuple, suffixes: tuple, *, kinds: _Kinds
+) -> tuple[Array, ...]:
     """Compute the fields of `_Connections` for pairs of primary vertex and suffix."""
-    vertex, suffix, _ = _pairs_of(number, chosen)[:3]
-    ends = _Ends(*ends)
-    reusable = dr.gather(Bool, ends.reusable, suffix) & dr.gather(Bool, ends.allows_reuse, vertex)
-    si1 = dr.gather(mi.SurfaceInteraction3f, interaction_from_parts(ends.si1), vertex, reusable)
-    si2 = dr.gather(mi.SurfaceInteraction3f, interaction_from_parts(ends.si2), suffix, reusable)
+    vertex, suffix, group, *_ = _pairs_of(number, chosen)
+    *parts, transmission, allows_reuse = gather_rows(vertices, (*INTERACTION, *_OF_VERTEX), vertex, True)
+    si1 = interaction_from_parts(parts)
+    si2, of_suffix = _read_suffix(kinds, suffixes, group)
+    reusable = of_suffix.reusable & allows_reuse
     # from where a ray to x2 begins, a little off x1: beside it, that is another direction than from x1
     offset = si2.p - spawn(si1, si2.p - si1.p).o
     distance2 = dr.squared_norm(offset)
@@ -185,21 +219,19 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array, fil
     passed, leg = segment(world, si1, si2.p, reusable & (value1[0] > 0), spread=False)
     # a suffix is seen from where it came, whatever rounding says
     own = vertex == suffix
-    passed = dr.select(own, dr.gather(Float, ends.own_transmission, suffix, reusable), passed)
-    leg = dr.select(own, dr.gather(Float, ends.leg, suffix, reusable), leg)
+    passed = dr.select(own, of_suffix.own_transmission, passed)
+    leg = dr.select(own, of_suffix.leg, leg)
     active = reusable & (value1[0] > 0) & (passed > 0) & (distance2 > 0)
     si2.wi = si2.to_local(-direction)
-    to_laser = si2.to_local(gather_vector(ends.to_laser, suffix, active))
-    value2 = si2.bsdf().eval(context, si2, to_laser, active)[0]
-    irradiance = dr.gather(Float, ends.irradiance, suffix, active)
-    going = active & dr.gather(Bool, ends.onward, suffix, active)
-    onward = si2.to_local(gather_vector(ends.onward_direction, suffix, going))
+    value2 = si2.bsdf().eval(context, si2, si2.to_local(of_suffix.to_laser), active)[0]
+    going = active & of_suffix.onward
+    onward = si2.to_local(of_suffix.onward_direction)
     value3, density3 = si2.bsdf().eval_pdf(context, si2, onward, going)
     area = dr.abs(dr.dot(si2.n, direction)) / distance2
-    reach = dr.gather(Float, ends.transmission, vertex, active) * value1[0] * area * passed
-    if ends.density is not None:
-        lit = lit_density(dr.gather(Float, ends.density, suffix, active), distance2, dr.dot(si2.n, direction))
-        if filtered:
+    reach = transmission * value1[0] * area * passed
+    if of_suffix.density is not None:
+        lit = lit_density(of_suffix.density, distance2, dr.dot(si2.n, direction))
+        if kinds.filtered:
             diffuse = diffuse_fraction(world, si1, direction, value1[0], active)
             value2 *= mis_weight_filtered(diffuse, dr.dot(si1.sh_frame.n, direction), lit, BLOCK)
         else:
@@ -214,9 +246,9 @@ def _connect(world: TracedScene, number: UInts, chosen: UInts, *ends: Array, fil
     # where nothing is reflected Mitsuba's coated lobes state a density, but no sample goes there
     density = dr.select(active, density1 * area, 0)
     onward_density = dr.select(going & (value3[0] > 0), density * density3, 0)
-    value = dr.select(active, reach * value2 * irradiance, 0)
+    value = dr.select(active, reach * value2 * of_suffix.irradiance, 0)
     seen = SeenVertex(si2, reach, at_x1, density3, active, going)
-    joined = None if ends.joined is None else joined_factors(world, ends.joined, suffix, seen)
+    joined = None if of_suffix.joined is None else joined_factors(world, of_suffix.joined, seen)
     onward = dr.select(going, reach * value3[0], 0)
     joined_density = None if joined is None else dr.select(joined.value > 0, density, 0)
     dr.eval(leg, value, onward, ratio, retro, density, onward_density, joined and tuple(joined), joined_density)
@@ -237,19 +269,12 @@ class _Weights(NamedTuple):
 
 
 def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
-    primary, suffixes = paths.primary, paths.suffixes
-    ends = _Ends(  # type: ignore[call-arg]
-        parts_of(primary.si),
-        primary.transmission,
-        primary.allows_reuse,
-        parts_of(suffixes.si),
-        *(getattr(suffixes, name) for name in _Ends._fields[4:-1]),
-        None if suffixes.joined is None else tuple(suffixes.joined[:4]),
-    )
+    suffixes = paths.suffixes
+    kinds = _Kinds(paths.primary.is_filtered, suffixes.density is not None, suffixes.joined is not None)
     dr.eval(pairs.number)
-    work = partial(_connect, filtered=primary.is_filtered)
-    key = "pairs", primary.is_filtered
-    made = _Connections(*world.recordings.call(world, key, work, pairs.number, pairs.chosen, *ends))
+    rows = _rows_of(paths, pairs.chosen)
+    work = partial(_connect, kinds=kinds)
+    made = _Connections(*world.recordings.call(world, ("pairs", kinds), work, pairs.number, pairs.chosen, *rows))
 
     def weighted(value: Floats, total: Floats) -> Array:
         density = dr.gather(Float, total, pairs.group)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Generators, Interactions, Masks, Rays, UInts, Vectors
@@ -40,18 +41,18 @@ def shape_index(si: Interactions) -> Array:
     return dr.reinterpret_array(UInt32, si.shape)
 
 
-_KEPT = ("p", "n", "uv", "sh_frame", "wi", "shape", "prim_index")
+_KEPT = ("p", "n", "uv", "sh_frame", "shape", "prim_index", "wi")
 
 
 def parts_of(si: Interactions) -> tuple[Array, ...]:
-    """Return what reflectance and rays need of an interaction."""
+    """Return what reflectance and rays need of an interaction; the last part says from where it is seen."""
     return tuple(getattr(si, name) for name in _KEPT)
 
 
-def interaction_from_parts(parts: tuple[Array, ...]) -> Array:
-    """Return the interaction with these parts alone."""
+def interaction_from_parts(parts: Sequence[Array]) -> Array:
+    """Return the interaction with these parts alone; the last one may be left out."""
     few = dr.zeros(mi.SurfaceInteraction3f, dr.width(parts[0]))
-    for name, part in zip(_KEPT, parts, strict=True):
+    for name, part in zip(_KEPT, parts, strict=False):
         setattr(few, name, part)
     return few
 

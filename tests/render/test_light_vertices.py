@@ -102,7 +102,8 @@ def test_lit_points_cover_what_the_laser_lights(cone_deg):
     """The mean of 1 / density is the area lit: all of a closed room, or the patch that a cone cuts from a wall."""
     vertices, faces, _ = box((4, 3, 5))
     walls = Surface(vertices + [0, 0, -1.5], faces[:, ::-1], Material(albedo=0.6))
-    found = points(TracedScene(Scene("box", (walls,), oracles.camera(8, 8, 20), Laser("flood", cone_deg=cone_deg))))
+    scene = Scene("box", (walls,), oracles.camera(8, 8, 20), Laser("flood", cone_deg=cone_deg))
+    found = points(TracedScene(scene)).all()
     assert (found.irradiance.numpy() > 0).mean() > 0.999
     inverse = 1 / found.density.numpy().astype(np.float64)
     area = 2 * (4 * 3 + 4 * 5 + 3 * 5) if cone_deg == 360 else np.pi * (4 * np.tan(np.radians(20))) ** 2
@@ -112,7 +113,8 @@ def test_lit_points_cover_what_the_laser_lights(cone_deg):
 def test_lit_points_carry_the_lasers_light():
     """Irradiance and path are those of `laser_light`; batches have points of their own, spread as evenly."""
     world = TracedScene(room())
-    found = points(world, 1 << 12, batches=4)
+    vertices = points(world, 1 << 12, batches=4)
+    found = vertices.all()
     _, irradiance, path = laser_light(
         world,
         found.si,
@@ -123,7 +125,7 @@ def test_lit_points_carry_the_lasers_light():
     assert np.array_equal(irradiance.numpy(), found.irradiance.numpy()) and np.array_equal(
         path.numpy(), found.path.numpy()
     )
-    each = int(found.each.numpy()[0])
+    each = int(vertices.each.numpy()[0])
     directions = np.array([part.numpy() for part in found.to_laser]).T[: 4 * each].reshape(4, each, 3)
     assert np.abs(directions.mean(axis=1)).max() < 4 / each**0.75  # of independent points 1/sqrt(3 each)
     assert not np.array_equal(directions[0], directions[1])
