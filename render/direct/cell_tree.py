@@ -28,9 +28,11 @@ MAX_CELLS = 128
 GLINT_LEVELS = 2
 # A wire that runs through the image is followed by at most this many launches.
 MAX_LAUNCHES = 256
-# Passes end when there is less to cut than edge_threshold times this share of what the first one cut: a pass takes as
-# long as ten thousand rays, and the last few edges are worth less (measured in rooms: 4 % more error, 26 % less time).
-LAST_FRACTION = 1 / 32
+# Passes end when there are few cells left to cut: a pass takes as long as some thousand rays, and the last few edges are
+# worth less. How few: as many as PASS_CELLS, but between these shares of what the first pass cut, times edge_threshold
+# (measured in rooms: 4 % more error, 28 % less time).
+PASS_CELLS = 400
+LAST_FRACTIONS = 1 / 32, 1 / 8
 
 # columns of tables
 PIXEL, LEVEL, COLUMN, ROW = range(len(Place._fields))
@@ -86,7 +88,7 @@ class CellTree:
         """Cut cells until none needs it or is `levels` deep; whether a cell of each pixel was, (pixels,) bool.
 
         An edge that could change less than `edge_threshold` of the root mean square of the pixels' radiance is left,
-        and so are the last few (LAST_FRACTION) where many were cut.
+        and so are the last few (PASS_CELLS) where many were cut.
         """
         touched = np.zeros(len(self.pixels), bool)
         if len(self.pixels) == 0:
@@ -96,7 +98,7 @@ class CellTree:
         pending = self._first_cuts()
         if levels == 0:
             return touched
-        few = LAST_FRACTION * edge_threshold * self.grid**2 * len(pending)
+        few = np.clip(PASS_CELLS, *(edge_threshold * self.grid**2 * len(pending) * part for part in LAST_FRACTIONS))
         for _ in range(MAX_LAUNCHES):
             if len(pending) <= few:
                 break
@@ -128,7 +130,7 @@ class CellTree:
         found = self._trace(place)
         new = slice(self.used, self.used + len(place))
         if new.stop > len(self.child):
-            self._reserve(new.stop + new.stop // 2)
+            self._reserve(3 * new.stop)  # memory that is not written takes none
         self.child[new], self.table.place[new] = -1, place
         for name in _COLUMNS:
             getattr(self, name)[new] = getattr(found, name)
@@ -162,7 +164,7 @@ class CellTree:
     def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
         """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""
         self.child[parents] = np.arange(self.used, self.used + 4 * len(parents), 4, dtype=np.int32)
-        doubled = self.table.place[parents] * np.array([1, 1, 2, 2], np.int32)
+        doubled = self.table.place.take(parents, axis=0) * np.array([1, 1, 2, 2], np.int32)
         place = np.repeat(doubled, 4, axis=0).reshape(-1, *_CHILDREN.shape) + _CHILDREN
         self._add(place.reshape(-1, 4))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
