@@ -28,7 +28,7 @@ MAX_CELLS = 128
 GLINT_LEVELS = 2
 # A wire that runs through the image is followed by at most this many launches.
 MAX_LAUNCHES = 256
-# Passes end when there are few cells left to cut: a pass takes as long as some thousand rays, and the last few edges are
+# Passes end when few cells are left to cut: a pass takes as long as some thousand rays, and the last few edges are
 # worth less. How few: as many as PASS_CELLS, but between these shares of what the first pass cut, times edge_threshold
 # (measured in rooms: 4 % more error, 28 % less time).
 PASS_CELLS = 400
