@@ -119,7 +119,11 @@ class CellTree:
 
     def rank(self, cells: np.ndarray) -> np.ndarray:
         """Look up the place in `pixels` of cells' pixels."""
-        return self.rank_of[self.table.place[cells, PIXEL] - self.first]
+        return self.rank_of.take(self.pixel(cells) - self.first)
+
+    def pixel(self, cells: np.ndarray) -> np.ndarray:
+        """Return the flat indices of cells' pixels."""
+        return self.table.place.ravel().take(cells * self.table.place.shape[1] + PIXEL)
 
     def _trace(self, place: np.ndarray, *, clip: bool = False) -> Footprints:
         self.rays += len(place)

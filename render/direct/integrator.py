@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, UInts
-from render.direct.cell_tree import MAX_CELLS, PIXEL, CellTree
+from render.direct.cell_tree import MAX_CELLS, CellTree
 from render.direct.footprints import albedo
 from render.scene.rays import camera_rays, first_opaque
 from render.scene.refraction import refracted_hit
@@ -118,8 +118,8 @@ def _samples(tree: CellTree, cells: np.ndarray, tolerance_m: float) -> Samples:
     wide = np.flatnonzero(minor > max(tolerance_m, NARROW_M))
     found = no_samples(count + len(wide))
     pixel, path, half_width, radiance, _ = found
-    columns = tree.table.place[:, PIXEL], tree.path_m, tree.half_width_m, tree.energy
-    for column, values in zip(found, columns, strict=False):
+    pixel[:count] = tree.pixel(cells)
+    for column, values in ((path, tree.path_m), (half_width, tree.half_width_m), (radiance, tree.energy)):
         np.take(values, cells, out=column[:count], mode="clip")  # other modes copy once more
     found.bounces[:] = 1
     minor = minor[wide]
@@ -174,7 +174,7 @@ def _merge_rows(tree: CellTree, index: np.ndarray, energy: np.ndarray) -> Sample
     total: np.ndarray = sum(weight)  # type: ignore[assignment]  # of arrays: one after the other
     centroid = sum(weight * path) / total if len(total) else total
     variance = sum(weight * ((path - centroid) ** 2 + half_width**2 / 3)) / total if len(total) else total
-    pixel = tree.table.place[index[:, 0], PIXEL]
+    pixel = tree.pixel(index[:, 0])
     return packed(pixel, centroid, np.sqrt(3 * variance), total, np.ones(len(index), np.uint8))
 
 
