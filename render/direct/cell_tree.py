@@ -98,7 +98,8 @@ class CellTree:
         pending = self._first_cuts()
         if levels == 0:
             return touched
-        few = np.clip(PASS_CELLS, *(edge_threshold * self.grid**2 * len(pending) * part for part in LAST_FRACTIONS))
+        least, most = (edge_threshold * self.grid**2 * len(pending) * part for part in LAST_FRACTIONS)
+        few = min(max(PASS_CELLS, least), most)
         for _ in range(MAX_LAUNCHES):
             if len(pending) <= few:
                 break
