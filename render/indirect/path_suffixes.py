@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from render.backend.drjit_types import Array, Floats, Generators, Interactions, LobeSamples, Masks, UInts, Vectors
@@ -30,7 +31,17 @@ from render.indirect.light_vertices import (
 )
 from render.indirect.primary_vertices import PrimaryVertices, sampling_techniques
 from render.indirect.retro_paths import ReachedVertex, connect_retro
-from render.scene.rays import first_opaque, kept, laser_light, sample_bsdf, shape_index, spawn
+from render.scene.rays import (
+    first_opaque,
+    interaction_from_parts,
+    kept,
+    laser_light,
+    parts_of,
+    sample_bsdf,
+    shape_index,
+    spawn,
+)
+from render.scene.rows import PLACE_ON_SURFACE, gather_rows, packed
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 from render.specular.mirrors import mirrors_in_row, without_mirrored_light
 
@@ -75,6 +86,43 @@ class PathSuffixes(NamedTuple):
     length: UInts
     soonest_m: Floats
     joined: JoinedVertex | None
+
+
+class SharedSuffix(NamedTuple):
+    """What other pixels' x1 need of a suffix: parts of `PathSuffixes`, with the first four of a `JoinedVertex`."""
+
+    own_transmission: Floats
+    leg: Floats
+    to_laser: Vectors
+    irradiance: Floats
+    onward: Masks
+    onward_direction: Vectors
+    reusable: Masks
+    density: Floats
+    joined: tuple[Array, ...] | None
+    si: Interactions
+
+
+# kinds of these parts but the last three, and of a joined vertex's
+_SHARED = (Float, Float, mi.Vector3f, Float, Bool, mi.Vector3f, Bool)
+_JOINED = (mi.Vector3f, Float, Float, Float)
+
+
+def pack_suffixes(suffixes: PathSuffixes, chosen: UInts | None) -> tuple[Array, ...]:
+    """Return what other pixels need of the chosen suffixes (None: of all), by row."""
+    shared = [getattr(suffixes, name) for name in SharedSuffix._fields[: len(_SHARED)]]
+    density = () if suffixes.density is None else (suffixes.density,)
+    joined = () if suffixes.joined is None else suffixes.joined[: len(_JOINED)]
+    return packed((*parts_of(suffixes.si)[:-1], *shared, *density, *joined), chosen)
+
+
+def read_suffix(rows: Sequence[Array], index: UInts, *, connected: bool, joined: bool) -> SharedSuffix:
+    """Read packed suffixes; `connected` with a density, and `joined` with a joined vertex."""
+    kinds = PLACE_ON_SURFACE, _SHARED, (Float,) if connected else (), _JOINED if joined else ()
+    columns = iter(gather_rows(rows, [kind for part in kinds for kind in part], index, True))
+    place, shared, density, vertex = (tuple(next(columns) for _ in part) for part in kinds)
+    known = (*shared, density[0] if density else None, vertex or None, interaction_from_parts(place))
+    return SharedSuffix(*known)
 
 
 class Slots(NamedTuple):

@@ -18,7 +18,7 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
-from render.backend.drjit_types import Array, Floats, Interactions, Masks, UInts, Vectors
+from render.backend.drjit_types import Array, Floats, Masks, UInts
 from render.indirect.accumulators import IndirectAccumulator
 from render.indirect.camera_paths import PathBatch
 from render.indirect.glossy import (
@@ -42,10 +42,11 @@ from render.indirect.light_vertices import (
     slot_factors,
 )
 from render.indirect.path_space_filter import UNIT_WEIGHT, ArrivingLight, PathSpaceFilter
+from render.indirect.path_suffixes import pack_suffixes, read_suffix
 from render.indirect.primary_vertices import reuses_early_paths
 from render.indirect.retro_paths import has_retro_paths, retro_ratio
 from render.scene.rays import interaction_from_parts, parts_of, segment, spawn
-from render.scene.rows import INTERACTION, PLACE_ON_SURFACE, gather_rows, packed
+from render.scene.rows import INTERACTION, gather_rows, packed
 from render.scene.traced_scene import Bool, Float, TracedScene, UInt32, dr, mi
 
 # Of one launch, 30 and 75 MB in its course; 40 MB more under a lamp, where x2 is joined.
@@ -135,27 +136,6 @@ def _early(paths: PathBatch) -> Array:
     return suffixes.reusable & (dr.block_reduce(dr.ReduceOp.Max, near, BLOCK) > 0)
 
 
-class _Suffix(NamedTuple):
-    """What pairs need of a suffix: see `PathSuffixes`."""
-
-    own_transmission: Floats
-    leg: Floats
-    to_laser: Vectors
-    irradiance: Floats
-    onward: Masks
-    onward_direction: Vectors
-    reusable: Masks
-    density: Floats = None
-    joined: tuple | None = None
-
-
-# kinds of what follows an interaction in the rows of primary vertices (transmission, whether they allow reuse), and in
-# those of suffixes: parts of `_Suffix`, and of `JoinedVertex` where there is one
-_OF_VERTEX = (Float, Bool)
-_OF_SUFFIX = (Float, Float, mi.Vector3f, Float, Bool, mi.Vector3f, Bool)
-_OF_JOINED = (mi.Vector3f, Float, Float, Float)
-
-
 class _Kinds(NamedTuple):
     """What recordings of pairs differ in: whether late light is filtered, whether there are light vertices, and whether
     x2 is joined to them."""
@@ -181,34 +161,14 @@ class _Connections(NamedTuple):
     joined_density: Floats
 
 
-def _rows_of(paths: PathBatch, chosen: UInts | None) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Return what pairs need of primary vertices and of the chosen suffixes, by row."""
-    primary, suffixes = paths.primary, paths.suffixes
-    columns = [getattr(suffixes, name) for name in _Suffix._fields[:-1]]
-    columns += [] if suffixes.joined is None else suffixes.joined[: len(_OF_JOINED)]
-    return (
-        packed((*parts_of(primary.si), primary.transmission, primary.allows_reuse)),
-        packed([part for part in (*parts_of(suffixes.si)[:-1], *columns) if part is not None], chosen),
-    )
-
-
-def _read_suffix(kinds: _Kinds, rows: tuple[Array, ...], group: UInts) -> tuple[Interactions, _Suffix]:
-    """Read x2 and what pairs need of a suffix."""
-    parts = PLACE_ON_SURFACE, _OF_SUFFIX, (Float,) if kinds.connected else (), _OF_JOINED if kinds.joined else ()
-    columns = iter(gather_rows(rows, [kind for part in parts for kind in part], group, True))
-    si, known, density, joined = ([next(columns) for _ in part] for part in parts)
-    of_suffix = _Suffix(*known)._replace(density=next(iter(density), None), joined=tuple(joined) or None)
-    return interaction_from_parts(si), of_suffix
-
-
 def _connect(
     world: TracedScene, number: UInts, chosen: UInts, vertices: tuple, suffixes: tuple, *, kinds: _Kinds
 ) -> tuple[Array, ...]:
     """Compute the fields of `_Connections` for pairs of primary vertex and suffix."""
     vertex, suffix, group, *_ = _pairs_of(number, chosen)
-    *parts, transmission, allows_reuse = gather_rows(vertices, (*INTERACTION, *_OF_VERTEX), vertex, True)
-    si1 = interaction_from_parts(parts)
-    si2, of_suffix = _read_suffix(kinds, suffixes, group)
+    *parts, transmission, allows_reuse = gather_rows(vertices, (*INTERACTION, Float, Bool), vertex, True)
+    of_suffix = read_suffix(suffixes, group, connected=kinds.connected, joined=kinds.joined)
+    si1, si2 = interaction_from_parts(parts), of_suffix.si
     reusable = of_suffix.reusable & allows_reuse
     # from where a ray to x2 begins, a little off x1: beside it, that is another direction than from x1
     offset = si2.p - spawn(si1, si2.p - si1.p).o
@@ -269,12 +229,12 @@ class _Weights(NamedTuple):
 
 
 def _weights(world: TracedScene, paths: PathBatch, pairs: _Pairs) -> _Weights:
-    suffixes = paths.suffixes
-    kinds = _Kinds(paths.primary.is_filtered, suffixes.density is not None, suffixes.joined is not None)
+    primary, suffixes = paths.primary, paths.suffixes
+    kinds = _Kinds(primary.is_filtered, suffixes.density is not None, suffixes.joined is not None)
     dr.eval(pairs.number)
-    rows = _rows_of(paths, pairs.chosen)
-    work = partial(_connect, kinds=kinds)
-    made = _Connections(*world.recordings.call(world, ("pairs", kinds), work, pairs.number, pairs.chosen, *rows))
+    vertices = packed((*parts_of(primary.si), primary.transmission, primary.allows_reuse))
+    given = pairs.number, pairs.chosen, vertices, pack_suffixes(suffixes, pairs.chosen)
+    made = _Connections(*world.recordings.call(world, ("pairs", kinds), partial(_connect, kinds=kinds), *given))
 
     def weighted(value: Floats, total: Floats) -> Array:
         density = dr.gather(Float, total, pairs.group)
