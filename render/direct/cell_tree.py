@@ -169,8 +169,8 @@ class CellTree:
     def _cut(self, parents: np.ndarray, levels: int) -> np.ndarray:
         """Cut cells in four; the cells (children, and older leaves beside them) that now need cutting, sorted."""
         self.child[parents] = np.arange(self.used, self.used + 4 * len(parents), 4, dtype=np.int32)
-        doubled = self.table.place.take(parents, axis=0) * np.array([1, 1, 2, 2], np.int32)
-        place = np.repeat(doubled, 4, axis=0).reshape(-1, *_CHILDREN.shape) + _CHILDREN
+        at_twice = self.table.place.take(parents, axis=0) * np.array([1, 1, 2, 2], np.int32)
+        place = np.repeat(at_twice, 4, axis=0).reshape(-1, *_CHILDREN.shape) + _CHILDREN
         self._add(place.reshape(-1, 4))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
         bits = child_edges(tree, self.table, parents, float(self.least))[: self.used]

@@ -6,7 +6,6 @@ A kernel that gathers columns one by one reads memory once for each; eight numbe
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from render.backend.drjit_types import Array, Masks, UInts
 from render.scene.traced_scene import Bool, Float, UInt32, dr, mi
@@ -36,7 +35,7 @@ def packed(columns: Sequence[Array], index: UInts | None = None) -> tuple[Array,
     return tuple(rows)
 
 
-def gather_rows(rows: Sequence[Array], kinds: Sequence[Any], index: UInts, active: Masks) -> list[Array]:
+def gather_rows(rows: Sequence[Array], kinds: Sequence[type], index: UInts, active: Masks) -> list[Array]:
     """Return the columns, of these kinds, of the entries `index`; zeros where not `active`."""
     halves = (dr.gather(mi.Vector4f, row, 2 * index + half, active) for row in rows for half in range(2))
     numbers = (number for half in halves for number in half)
@@ -60,7 +59,7 @@ def _as_float(number: Array) -> Array:
     return number if isinstance(number, Float) else dr.reinterpret_array(Float, dr.reinterpret_array(UInt32, number))
 
 
-def _from_floats(kind: Any, numbers: Iterator[Array]) -> Array:
+def _from_floats(kind: type, numbers: Iterator[Array]) -> Array:
     if kind is mi.Frame3f:
         s, n = (_from_floats(vector, numbers) for vector in (mi.Vector3f, mi.Normal3f))
         return mi.Frame3f(s, dr.cross(n, s), n)
