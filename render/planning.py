@@ -126,7 +126,7 @@ def refracting(world: TracedScene, settings: RenderSettings) -> TracedScene:
 
 
 def _check_laser(mode: LaserMode, settings: RenderSettings) -> None:
-    """Raise InputError for settings of indirect light that mean nothing under a laser of this mode."""
+    """Raise InputError for settings of indirect light that mean nothing under a laser of this mode, or without any."""
     if settings.filter and mode != "flood":
         raise InputError(
             f"render: a filter shares light of a flood laser among pixels, this one is {mode}: leave it out"

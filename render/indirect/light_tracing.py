@@ -98,7 +98,8 @@ def _trace_launch(world: TracedScene, columns: Sequence[Array], keys: Sequence[A
     dr.eval(targets, paths, values)
     numbers = dr.opaque(UInt32, lanes), dr.opaque(UInt32, bounces - 1)
     given = tuple(columns), tuple(keys), numbers, (targets, paths, values)
-    return world.recordings.call(world, ("light paths", bounces), _light_paths, *given)
+    key = "light paths", bounces, has_retro_paths(world)
+    return world.recordings.call(world, key, _light_paths, *given)
 
 
 @dr.syntax
