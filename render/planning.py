@@ -126,23 +126,17 @@ def refracting(world: TracedScene, settings: RenderSettings) -> TracedScene:
 
 
 def _check_laser(mode: LaserMode, settings: RenderSettings) -> None:
-    """Raise InputError for settings of indirect light that mean nothing under a laser of this mode, or without any."""
+    """Raise InputError for settings of indirect light that mean nothing under a laser of this mode."""
     if settings.filter and mode != "flood":
         raise InputError(
             f"render: a filter shares light of a flood laser among pixels, this one is {mode}: leave it out"
         )
-    if not _is_direct_alone(mode, settings):
-        return
-    lacking = "bounces 1 leaves out" if settings.bounces == 1 else "a scanning laser has only with bounces above 1"
     for name in ("spp", "clamp"):
         value = getattr(settings, name)
-        if value is not None:
-            raise InputError(f"render: {name} {value:g} is for indirect light, which {lacking}")
-
-
-def _is_direct_alone(mode: LaserMode, settings: RenderSettings) -> bool:
-    """Return whether a plan has no indirect light: where it is not asked for, and beside a scanning laser."""
-    return settings.bounces == 1 or (settings.bounces is None and mode == "scan")
+        if mode == "scan" and settings.bounces is None and value is not None:
+            raise InputError(
+                f"render: {name} {value:g} is for indirect light, which a scanning laser has only with bounces above 1"
+            )
 
 
 def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
@@ -154,7 +148,7 @@ def make_plan(world: TracedScene, settings: RenderSettings, seed: int) -> Plan:
     reasons = list(_limits(world))
     mode_is_flood = world.scene.laser.mode == "flood"
     _check_laser(world.scene.laser.mode, settings)
-    direct_alone = _is_direct_alone(world.scene.laser.mode, settings)
+    direct_alone = settings.bounces == 1 or (settings.bounces is None and world.scene.laser.mode == "scan")
     fine = None
     if settings.grid is None or settings.budget is not None or not direct_alone:
         fine = pilot_response(world, pixels, max(PILOT_GRID, _grid_for_cone(world)))
