@@ -10,6 +10,7 @@ import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Masks, UInts
 from render.direct.footprints import HIT, LARGE, LIT
+from render.scene.rows import gather_rows
 from render.scene.traced_scene import Bool, Float, UInt32, dr, mi, recorded, upload
 
 # Two neighbours lie on one surface if their planes explain the step between their distances up to this [m]: a sixth of
@@ -330,9 +331,7 @@ def _at(columns: Array, index: UInts, active: bool | Masks = True) -> Array:
 
 def _row(table: Array, index: UInts, active: bool | Masks = True) -> Cells:
     """Gather the cells `index` from a table; zeros where not `active`."""
-    near, far = (dr.gather(mi.Vector4f, table[1], 2 * index + half, active) for half in range(2))
-    distance, slope_x, slope_y, radiance = near
-    cells = Cells(distance, slope_x, slope_y, radiance, far.x, dr.reinterpret_array(UInt32, far.y))
+    cells = Cells(*gather_rows(table[1:2], (*(Float,) * 5, UInt32), index, active))  # SURFACE, in order of their fields
     if len(table) == 2:
         return cells
     tilt_x, tilt_y, peak, _ = dr.gather(mi.Vector4f, table[2], index, active)
