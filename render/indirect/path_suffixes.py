@@ -89,7 +89,7 @@ class PathSuffixes(NamedTuple):
 
 
 class SharedSuffix(NamedTuple):
-    """What other pixels' x1 need of a suffix: parts of `PathSuffixes`, with the first four of a `JoinedVertex`."""
+    """Hold what other pixels' x1 need of a suffix: parts of `PathSuffixes`, with the first four of a `JoinedVertex`."""
 
     own_transmission: Floats
     leg: Floats

@@ -137,7 +137,7 @@ def _early(paths: PathBatch) -> Array:
 
 
 class _Kinds(NamedTuple):
-    """What recordings of pairs differ in: whether late light is filtered, whether there are light vertices, and whether
+    """Tell apart recordings of pairs: whether late light is filtered, whether there are light vertices, and whether
     x2 is joined to them."""
 
     filtered: bool
