@@ -6,19 +6,8 @@ import math
 
 import numpy as np
 
-from render.direct.edges import (
-    CUT,
-    GLINT,
-    HIGHLIGHT,
-    MIXED,
-    SURFACE,
-    Cells,
-    Place,
-    Table,
-    Tree,
-    child_edges,
-    first_edges,
-)
+from render.direct.children import EdgePairs, Tree, child_edges
+from render.direct.edges import CUT, GLINT, HIGHLIGHT, MIXED, SURFACE, Cells, Place, Table, first_edges
 from render.direct.footprints import CLIPPED, LARGE, Footprints, trace
 from render.scene.traced_scene import TracedScene, aligned
 
@@ -36,7 +25,7 @@ LAST_FRACTIONS = 1 / 32, 1 / 8
 
 # columns of tables
 PIXEL, LEVEL, COLUMN, ROW = range(len(Place._fields))
-FLAGS = SURFACE.index("flags")
+FLAGS, RADIANCE = SURFACE.index("flags"), SURFACE.index("radiance")
 # a cut cell's children, in the order of their rows: by how much level, column and row differ from twice the cell's
 _CHILDREN = np.array([(0, 1, 0, 0), (0, 1, 1, 0), (0, 1, 0, 1), (0, 1, 1, 1)], np.int32)
 _SPANS = ("path_m", "half_width_m", "minor_m")
@@ -71,6 +60,7 @@ class CellTree:
         self.used = self.rays = 0
         self.least = np.float32(0)
         self.mixed = np.zeros(len(pixels), bool)
+        self._pairs: list[EdgePairs] = []
         rows = np.empty((0, 4), np.float32)
         self.table = Table(rows.astype(np.int32), np.empty((0, 8), np.float32), rows if world.has_glints else None)
         self.child = np.empty(0, np.int32)
@@ -106,6 +96,22 @@ class CellTree:
             touched[self.rank(pending)] = True
             pending = self._cut(pending, levels)
         return touched
+
+    def place_edges(self) -> None:
+        """Let edges between leaves lie in the middle between their rays (`EdgePairs`), instead of where the cells meet.
+
+        Pairs of cells of level 0 stay: what their edges change is not worth a ray.
+        """
+        if not self._pairs:
+            return
+        one, other, area = (np.concatenate(column) for column in zip(*self._pairs, strict=True))
+        leaves = np.flatnonzero((self.child[one] < 0) & (self.child[other] < 0))
+        one, other, area = one[leaves], other[leaves], area[leaves]
+        radiance = self.table.surface[:, RADIANCE]
+        np.add.at(self.energy, one, area * radiance[one])
+        np.subtract.at(self.energy, other, area * radiance[other])
+        for cells in (one, other):  # amid others a cell may be left with less than nothing
+            self.energy[cells] = np.maximum(self.energy[cells], 0)
 
     def clip(self) -> int:
         """Clip the leaves that are still not small to their faces; the number that this changes."""
@@ -173,8 +179,9 @@ class CellTree:
         place = np.repeat(at_twice, 4, axis=0).reshape(-1, *_CHILDREN.shape) + _CHILDREN
         self._add(place.reshape(-1, 4))
         tree = Tree(self.grid, self.width, self.first, self.rank_of, self.child)
-        bits = child_edges(tree, self.table, parents, float(self.least))[: self.used]
-        marked, why = self._note(bits)
+        bits, pairs = child_edges(tree, self.table, parents, float(self.least))
+        self._pairs.append(pairs)
+        marked, why = self._note(bits[: self.used])
         deepest = np.where(why & GLINT, levels + GLINT_LEVELS, levels)
         return marked[(self.child[marked] < 0) & (self.table.place[marked, LEVEL] < deepest)]
 

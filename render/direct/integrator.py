@@ -93,6 +93,7 @@ def _chunk(
 ) -> DirectLight:
     tree = CellTree(world, pixels, grid)
     touched = tree.refine(max(0, min(refine, math.ceil(math.log2(MAX_CELLS / grid)))), edge_threshold / grid**2)
+    tree.place_edges()
     clipped = tree.clip()
     leaves = tree.child[: tree.used] < 0
     if tolerance_m == 0:

@@ -5,27 +5,28 @@ import math
 import numpy as np
 import pytest
 
+from render.direct.children import OFFSET_SHARE, WORTH_PLACING, Tree, child_edges
 from render.direct.edges import (
     CREASE_COSINE,
     CREASE_M,
     CUT,
     FOLLOWED,
     GLINT,
-    GLINT_WIDTH,
     HIGHLIGHT,
+    HIGHLIGHT_MARGIN,
     MIXED,
     MIXED_GAP_M,
+    RISE_SHARE,
     STEP_M,
     SURFACE,
     TONE,
     Cells,
     Place,
     Table,
-    Tree,
-    child_edges,
     first_edges,
 )
-from render.direct.footprints import HIT, LARGE, LIT
+from render.direct.footprints import HIT, LARGE, LIT, MOVED, MOVED_CUT
+from render.scene.rays import PLAIN_GOLDEN
 from render.scene.traced_scene import aligned
 
 HEIGHT, WIDTH, GRID, LEAST = 8, 9, 3, 0.02
@@ -51,19 +52,44 @@ def cells_of(seed: int, count: int = COUNT, *, glossy: bool = False) -> Cells:
 def between(cells: Cells, a: int, b: int, way: tuple[float, float]) -> tuple[bool, bool, float, bool, float]:
     """differ, apart, contrast, joined, glint: a sentence of `render.direct.edges` a line."""
     hits = [bool(cells.flags[i] & HIT) for i in (a, b)]
-    lits = [bool(cells.flags[i] & LIT) for i in (a, b)]
-    step = float(cells.distance_m[b]) - float(cells.distance_m[a])
-    rises = [float(cells.slope_x_m[i]) * way[0] + float(cells.slope_y_m[i]) * way[1] for i in (a, b)]
-    gap = max(step - max(rises), min(rises) - step) if all(hits) else 0.0
-    edge = gap > STEP_M or (all(hits) and abs(rises[0] - rises[1]) > CREASE_M) or hits[0] != hits[1]
-    edge = edge or lits[0] != lits[1]
+    rises = rises_of(cells, a, b, way)
+    edge = is_severed(cells, a, b, way) or (all(hits) and abs(rises[0] - rises[1]) > CREASE_M)
     bend = abs(float(cells.facing[a]) - float(cells.facing[b]))
     bright = max(float(cells.radiance[a]), float(cells.radiance[b]))
     tone = abs(float(cells.radiance[a]) - float(cells.radiance[b])) / bright if bright else 0.0
     differ = edge or (all(hits) and (bend > CREASE_COSINE or tone > TONE))
     joined = all(hits) and not edge
-    glint = highlight(cells, a, b) - bright if joined and cells.peak is not None else 0.0
-    return differ, gap > MIXED_GAP_M or hits[0] != hits[1], 1.0 if edge else max(bend, tone), joined, glint
+    glint = highlight(cells, a, b) if joined and cells.peak is not None else 0.0
+    if joined and cells.peak is not None and min(cells.peak[a], cells.peak[b]) > 0 and bright:
+        shine = [
+            float(cells.peak[i]) / (1 + float(cells.tilt_x[i]) ** 2 + float(cells.tilt_y[i]) ** 2) ** 2 for i in (a, b)
+        ]
+        paint = [float(cells.radiance[i]) - shining for i, shining in zip((a, b), shine, strict=True)]
+        tone = min(tone, abs(paint[0] - paint[1]) / bright)
+    return (
+        differ,
+        gap_of(cells, a, b, way) > MIXED_GAP_M or hits[0] != hits[1],
+        1.0 if edge else max(bend, tone),
+        joined,
+        glint,
+    )
+
+
+def is_severed(cells: Cells, a: int, b: int, way: tuple[float, float]) -> bool:
+    """One of both is nothing or in shadow, or their planes do not explain the step between them."""
+    return bool((cells.flags[a] ^ cells.flags[b]) & (HIT | LIT)) or gap_of(cells, a, b, way) > STEP_M
+
+
+def gap_of(cells: Cells, a: int, b: int, way: tuple[float, float]) -> float:
+    """How far the step between two hits is beyond what both planes predict."""
+    if not cells.flags[a] & cells.flags[b] & HIT:
+        return 0.0
+    step, rises = float(cells.distance_m[b]) - float(cells.distance_m[a]), rises_of(cells, a, b, way)
+    return max(step - max(rises), min(rises) - step)
+
+
+def rises_of(cells: Cells, a: int, b: int, way: tuple[float, float]) -> list[float]:
+    return [float(cells.slope_x_m[i]) * way[0] + float(cells.slope_y_m[i]) * way[1] for i in (a, b)]
 
 
 def highlight(cells: Cells, a: int, b: int) -> float:
@@ -71,8 +97,10 @@ def highlight(cells: Cells, a: int, b: int) -> float:
     tilts = np.array([(cells.tilt_x[i], cells.tilt_y[i]) for i in (a, b)], float)
     step = float(np.linalg.norm(tilts[1] - tilts[0]))
     nearest = np.linalg.norm(tilts[0] + np.linspace(0, 1, 1001)[:, None] * (tilts[1] - tilts[0]), axis=1).min()
-    peak = min(float(cells.peak[a]), float(cells.peak[b]))
-    return peak / (1 + max(nearest - step / 2, 0) ** 2) ** 2 * min(1.0, GLINT_WIDTH / max(step, 1e-9))
+    peak = min(float(cells.peak[a]), float(cells.peak[b])) / (1 + max(nearest - step / 2, 0) ** 2) ** 2
+    step = max(step, 1e-3)
+    missed = 2 * (1 + 2 * math.pi / step) * math.exp(-2 * math.pi / step) * min(1.0, math.pi / 2 / step)
+    return peak * max(HIGHLIGHT_MARGIN * missed, RISE_SHARE * min(step, 1.0))
 
 
 def index_of(x: int, y: int) -> int:
@@ -157,7 +185,7 @@ def test_children_are_compared_with_all_that_lies_beside_them(cut_before: int, g
             places += [Place(pixel, level + 1, 2 * column + i % 2, 2 * row + i // 2) for i in range(4)]
     count = len(places)
     cells = cells_of(cut_before, count, glossy=glossy)
-    where = {place[1:]: number for number, place in enumerate(places)}
+    where, areas = {place[1:]: number for number, place in enumerate(places)}, {}
     expected = np.where(cells.flags & LARGE, CUT, 0)
     expected[:start] = 0
     for number in range(start, count):
@@ -168,8 +196,13 @@ def test_children_are_compared_with_all_that_lies_beside_them(cut_before: int, g
             if beside is not None:
                 bits = bits_of_pair(cells, (number, beside), [places[number], places[beside]], grid)
                 expected[[number, beside]] |= bits
-    bits = child_edges(Tree(grid, width, first, rank_of, child[:count]), table_of(places, cells), parents, LEAST)
+                area = area_of_pair(cells, (number, beside), [places[number], places[beside]], grid)
+                if area and (beside < start or way_x + way_y > 0):  # two new cells meet once
+                    areas[number, beside] = area
+    bits, pairs = child_edges(Tree(grid, width, first, rank_of, child[:count]), table_of(places, cells), parents, LEAST)
     assert np.array_equal(bits, expected)
+    found = {(int(a), int(b)): area for a, b, area in zip(*pairs, strict=True)}
+    assert len(pairs.one) == len(found) > 100 and found == pytest.approx(areas, rel=1e-3)
     assert all(20 < np.count_nonzero(bits & bit) < count - 20 for bit in (CUT, MIXED, GLINT)[: 2 + glossy])
 
 
@@ -192,6 +225,35 @@ def bits_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid:
     energy, of_one_pixel = max(cells.radiance[list(pair)]) * max(widths) ** 2, places[0].pixel == places[1].pixel
     cut, shining = differ and energy * contrast >= LEAST, glint > 0 and glint * max(widths) ** 2 >= LEAST
     return CUT * cut | MIXED * (differ and apart and of_one_pixel) | GLINT * shining
+
+
+def area_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid: int) -> float:
+    """Area of the second cell on the first one's side of the middle between their rays, 0 if it is not to be placed."""
+    if places[0].pixel != places[1].pixel:
+        return 0.0
+    widths = [1 / (grid * 2**place.level) for place in places]
+    centres = np.array([((p.column + 0.5) * w, (p.row + 0.5) * w) for p, w in zip(places, widths, strict=True)])
+    ways = [abs(places[0][axis] // 2 ** (places[0].level - places[1].level) - places[1][axis]) for axis in (2, 3)]
+    axis = int(np.argmax(ways))  # they are beside each other along it
+    rays = [
+        centre[axis] + OFFSET_SHARE * width * ray_offset_of(place, axis, grid)
+        for centre, width, place in zip(centres, widths, places, strict=True)
+    ]
+    way = 1 if centres[1][axis] > centres[0][axis] else -1
+    border = centres[0][axis] + way * widths[0] / 2
+    area = way * ((rays[0] + rays[1]) / 2 - border) * widths[0]
+    severed = is_severed(cells, *pair, tuple(np.subtract(centres[1], centres[0])))
+    return area if severed and max(cells.radiance[list(pair)]) * abs(area) >= WORTH_PLACING * LEAST else 0.0
+
+
+def ray_offset_of(place: Place, axis: int, grid: int) -> float:
+    """Offset of a cell's ray along an axis in cell widths: golden turns by its row (along x) or column (along y)."""
+    number = place.row if axis == 0 else place.column
+    golden = PLAIN_GOLDEN / 2**32
+    if place.level > 0:
+        return MOVED_CUT * (number * golden % 1 - 0.5)
+    turns = (number - (number // grid + 0.5) * grid + 0.5) * (golden if axis == 0 else -golden)
+    return MOVED * (turns - round(turns))
 
 
 def test_nothing_to_compare() -> None:
