@@ -25,7 +25,7 @@ LAST_FRACTIONS = 1 / 32, 1 / 8
 
 # columns of tables
 PIXEL, LEVEL, COLUMN, ROW = range(len(Place._fields))
-FLAGS, RADIANCE = SURFACE.index("flags"), SURFACE.index("radiance")
+RADIANCE = SURFACE.index("radiance")
 # a cut cell's children, in the order of their rows: by how much level, column and row differ from twice the cell's
 _CHILDREN = np.array([(0, 1, 0, 0), (0, 1, 1, 0), (0, 1, 0, 1), (0, 1, 1, 1)], np.int32)
 _SPANS = ("path_m", "half_width_m", "minor_m")
@@ -61,6 +61,7 @@ class CellTree:
         self.least = np.float32(0)
         self.mixed = np.zeros(len(pixels), bool)
         self._pairs: list[EdgePairs] = []
+        self._large: list[np.ndarray] = []
         rows = np.empty((0, 4), np.float32)
         self.table = Table(rows.astype(np.int32), np.empty((0, 8), np.float32), rows if world.has_glints else None)
         self.child = np.empty(0, np.int32)
@@ -115,8 +116,7 @@ class CellTree:
 
     def clip(self) -> int:
         """Clip the leaves that are still not small to their faces; the number that this changes."""
-        flags = self.table.surface.view(np.uint32)[: self.used, FLAGS]
-        large = np.flatnonzero((flags & LARGE) != 0)  # by way of booleans, of which numpy skips those that are false
+        large = np.concatenate(self._large)
         large = large[self.child[large] < 0]
         if len(large) == 0:
             return 0
@@ -140,6 +140,8 @@ class CellTree:
         """Trace new cells and append them."""
         found = self._trace(place)
         new = slice(self.used, self.used + len(place))
+        # by way of booleans, of which numpy skips those that are false
+        self._large.append(self.used + np.flatnonzero((found.flags & LARGE) != 0))
         if new.stop > len(self.child):
             self._reserve(3 * new.stop)  # memory that is not written takes none
         self.child[new], self.table.place[new] = -1, place

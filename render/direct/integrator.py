@@ -117,10 +117,11 @@ def _samples(tree: CellTree, cells: np.ndarray, tolerance_m: float) -> Samples:
     halves along the smaller span, at p +- b/2 with half width sqrt(a^2 + b^2 / 4).
     """
     count = len(cells)
-    minor, half = tree.minor_m[cells], tree.half_width_m[cells]
-    least = max(tolerance_m, UNIFORM_M)
+    minor, least = tree.minor_m[cells], max(tolerance_m, UNIFORM_M)
+    wide = np.flatnonzero(minor > least)  # of others b^2 / a is less, too
     # b^4 > least^2 a^2, where the half width is sqrt(a^2 + b^2)
-    wide = np.flatnonzero(minor**2 * (minor**2 + least**2) > (least * half) ** 2)
+    square = minor[wide] ** 2
+    wide = wide[square * (square + least**2) > (least * tree.half_width_m[cells[wide]]) ** 2]
     found = no_samples(count + len(wide))
     pixel, path, half_width, radiance, _ = found
     pixel[:count] = tree.pixel(cells)
