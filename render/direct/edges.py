@@ -25,6 +25,9 @@ MIXED_GAP_M = 0.05
 # A cell follows its neighbours if its tangent plane is off the mean step to them by no more than this share of its
 # distance, a bent surface apart.
 FOLLOWED = 3e-4
+# A crease folds a cell where the planes' slopes differ by more than this share of the steeper one, and path lengths
+# grow no more than this many times as fast as distances: twice as fast, if the laser is at the camera.
+FOLD, FOLD_RATIO = 0.1, 2.5
 # Of what an unresolved highlight may cost: a margin, and the share of the rise across a cell that counts (measured: 1
 # to 1.5 and a quarter do best).
 HIGHLIGHT_MARGIN, RISE_SHARE = 1.25, 0.25
@@ -99,7 +102,8 @@ def first_edges(
     the other neighbour lies across an edge) and c their difference. Then the half span is |s| / 2 (c adds c^2 / 720 to
     the variance), and the mean path p_0 + c / 24 + g s / (12 r_0), summed over the axes: second order in the cell's
     width where the tangent plane is first, and blind to facets of a curved surface. At a crease the tangent plane
-    agrees with one of the steps instead of their mean, and is kept.
+    agrees with one of the steps instead of their mean, and is kept up to where the neighbour's meets it. From there on
+    the cell is on the neighbour's: paths turn back at an inner or outer corner, instead of going on beyond it.
     """
     if len(cells.flags) < 2:  # arrays of one entry are scalars to Dr.Jit: another kernel
         return np.where(cells.flags & LARGE, np.uint32(CUT), np.uint32(0)), *path_intervals
@@ -137,10 +141,12 @@ def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple
     per_radiance = dr.select(follows, dr.rcp(cells.radiance), 0)
     cut, mixed, glint = (cells.flags & LARGE) != 0, Bool(False), Bool(False)
     mean, variance, halves = Float(path), Float(0), []  # a copy: += would change the path
+    folded, turned, turned_halves = Bool(False), Float(0), []
     for axis in range(2):
         number, rise, rises, bend, run, bends = (Float(0) for _ in range(6))
         gain = Float(0)
         slope = cells[1 + axis] * pitch
+        shift, spread = Float(0), dr.square(slope) / 12
         for (inside, across, near, far), way in zip(sides[2 * axis : 2 * axis + 2], (1, -1), strict=True):
             there = inside | across
             index = dr.select(inside, near, far)
@@ -151,13 +157,20 @@ def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple
             cut |= there & between.differ & (brighter * between.contrast * pitch * pitch >= least)
             glint |= there & (between.glint > 0) & (between.glint * pitch * pitch >= least)
             mixed |= inside & between.differ & between.apart
+            fold = _fold(way * slope, way * other[1 + axis] * pitch, way * step)
+            crossed = there & ~between.severed & ((cells.flags & other.flags & HIT) != 0) & fold.exists
+            shift, spread = dr.select(crossed, fold.shift, shift), dr.select(crossed, fold.variance, spread)
+            folded |= crossed
             joined = there & between.joined
+            follows &= ~(crossed & ~joined)
             number += dr.select(joined, 1, 0)
             rise += dr.select(joined, step, 0)
             rises += dr.select(joined, way * step, 0)
             step = dr.select(joined, way * (dr.gather(Float, path, index, there) - path), 0)
             run, bends = run + step, bends + way * step
             gain += dr.select(joined, way * (other.radiance - cells.radiance), 0)
+        turned += shift
+        turned_halves.append(dr.sqrt(3 * spread))
         fraction, two = dr.rcp(dr.maximum(number, 1)), dr.select(number == 2, Float(1), Float(0))
         off = dr.abs(slope - rise * fraction)
         follows &= (number > 0) & (off <= dr.maximum(dr.abs(rises) * two / 4, FOLLOWED * cells.distance_m))
@@ -166,11 +179,56 @@ def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple
         mean += bend / 24 + gain * run / 12
         halves.append(dr.abs(run) / 2)
         variance += dr.square(run) / 4 + dr.square(bend) / 240
+    path, half, minor = _folded(cells, folded, (path, half, minor), (turned, turned_halves), pitch)
     return (
         bits_of(cut, mixed, glint),
         dr.select(follows, mean, path),
         dr.select(follows, dr.sqrt(variance), half),
         dr.select(follows, dr.minimum(*halves), minor),
+    )
+
+
+class _Fold(NamedTuple):
+    """Distances along one way over a cell that a crease crosses: whether one does, how far their mean is off the one at
+    the centre, and their variance [m^2]."""
+
+    exists: Masks
+    shift: Array
+    variance: Array
+
+
+def _fold(slope: Floats, other_slope: Floats, step: Floats) -> _Fold:
+    """Follow a cell's tangent plane up to where a neighbour's crosses it, and from there on the neighbour's.
+
+    All are [m] from one cell's centre to the next: the slopes of both planes and the step between both distances.
+    """
+    at = (step - other_slope) / (slope - other_slope)
+    before, beyond = 0.5 + at, 0.5 - at
+    start, crease = -0.5 * slope, at * slope
+    end = crease + beyond * other_slope
+    first, last = 0.5 * (start + crease), 0.5 * (crease + end)
+    shift = before * first + beyond * last
+    square = before * (dr.square(crease - start) / 12 + dr.square(first))
+    square += beyond * (dr.square(end - crease) / 12 + dr.square(last))
+    differ = dr.abs(slope - other_slope) > FOLD * dr.maximum(dr.abs(slope), dr.abs(other_slope))
+    return _Fold(differ & (dr.abs(at) < 0.5), shift, dr.maximum(square - dr.square(shift), 0))
+
+
+def _folded(cells: Cells, folded: Masks, spans: tuple, turned: tuple, pitch: Floats) -> tuple[Array, Array, Array]:
+    """Return path centre, half width and smaller half span [m]: of `folded` cells by the shift of their mean distance
+    and the half spans along both axes in `turned`, of others those in `spans`.
+
+    Path lengths grow in proportion to distances: exactly so where the laser is at the camera. A cell keeps its spans
+    where a laser that is aside makes them grow much faster.
+    """
+    path, half, minor = spans
+    shift, halves = turned
+    ratio = 2 * half / dr.maximum(dr.norm(mi.Vector2f(cells.slope_x_m, cells.slope_y_m)) * pitch, 1e-9)
+    folded &= ((cells.flags & (HIT | LARGE)) == HIT) & (ratio < FOLD_RATIO)
+    return (
+        dr.select(folded, path + ratio * shift, path),
+        dr.select(folded, ratio * dr.norm(mi.Vector2f(*halves)), half),
+        dr.select(folded, ratio * dr.minimum(*halves), minor),
     )
 
 

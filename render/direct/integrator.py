@@ -61,14 +61,17 @@ def direct_light(
 
     Every pixel starts as grid x grid cells, one ray and footprint each (`render.direct.footprints`). A cell is cut in
     four, at most `refine` times and down to 1/MAX_CELLS of a pixel or less, where
-    - its footprint is not small, so that first order no longer describes it; or
+    - its footprint is not small, so that first order no longer describes it;
+    - a highlight on it may be too narrow for it (`render.direct.edges.compare`); or
     - it and a neighbouring cell lie on different surfaces, or one is in shadow, or one is painted darker: an edge runs
       through one of them.
-      An edge that could change less than `edge_threshold` of a first cell's energy, in a pixel of the root mean square
-      of its group's radiance, is left alone; by default `default_edge_threshold` the grid.
+      An edge or highlight that could change less than `edge_threshold` of a first cell's energy, in a pixel of the root
+      mean square of its group's radiance, is left alone; by default `default_edge_threshold` the grid.
+
     New cells are compared with their neighbours too, of whatever size and pixel, and those are cut in turn: a wire
-    thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. Footprints
-    not small at the end are clipped to the face they lie on, and counted if that changes them.
+    thinner than a cell is followed from wherever a ray hit it. All cuts of a pass are traced in one launch. What
+    silhouettes and shadows part in the end is parted in the middle between the rays (`render.direct.children`).
+    Footprints not small at the end are clipped to the face they lie on, and counted if that changes them.
 
     Small cells that are not cut, and whose neighbours lie on the same surface, take their spread of path lengths from
     them instead of from the tangent plane (`render.direct.edges.first_edges`).

@@ -10,6 +10,8 @@ from render.direct.edges import (
     CREASE_COSINE,
     CREASE_M,
     CUT,
+    FOLD,
+    FOLD_RATIO,
     FOLLOWED,
     GLINT,
     HIGHLIGHT,
@@ -75,6 +77,22 @@ def between(cells: Cells, a: int, b: int, way: tuple[float, float]) -> tuple[boo
     )
 
 
+def step_of(cells: Cells, a: int, b: int) -> float:
+    return float(cells.distance_m[b]) - float(cells.distance_m[a])
+
+
+def fold_of(slope: float, other_slope: float, step: float) -> tuple[float, float] | None:
+    """Mean off the centre's and variance of 4,000 distances across a cell that a crease crosses."""
+    if abs(slope - other_slope) <= FOLD * max(abs(slope), abs(other_slope)):
+        return None
+    crease = (step - other_slope) / (slope - other_slope)
+    if abs(crease) >= 0.5:
+        return None
+    at = (np.arange(4000) + 0.5) / 4000 - 0.5
+    distances = np.where(at < crease, slope * at, step + other_slope * (at - 1))
+    return float(distances.mean()), float(distances.var())
+
+
 def is_severed(cells: Cells, a: int, b: int, way: tuple[float, float]) -> bool:
     """One of both is nothing or in shadow, or their planes do not explain the step between them."""
     return bool((cells.flags[a] ^ cells.flags[b]) & (HIT | LIT)) or gap_of(cells, a, b, way) > STEP_M
@@ -84,7 +102,7 @@ def gap_of(cells: Cells, a: int, b: int, way: tuple[float, float]) -> float:
     """How far the step between two hits is beyond what both planes predict."""
     if not cells.flags[a] & cells.flags[b] & HIT:
         return 0.0
-    step, rises = float(cells.distance_m[b]) - float(cells.distance_m[a]), rises_of(cells, a, b, way)
+    step, rises = step_of(cells, a, b), rises_of(cells, a, b, way)
     return max(step - max(rises), min(rises) - step)
 
 
@@ -118,11 +136,14 @@ def test_first_cells_are_compared_with_their_neighbours(seed: int, whole: bool, 
     filter_octaves = [draw.uniform(low, high, COUNT).astype(np.float32) for low, high in ((4, 5), (0, 0.1), (0, 0.05))]
     bits, path, half, minor = first_edges(cells, filter_octaves, GRID, WIDTH if whole else 0, LEAST)
     cut, mixed, shining = (cells.flags & LARGE) != 0, np.zeros(COUNT, bool), np.zeros(COUNT, bool)
-    followed = 0
+    followed = turned = 0
     for y, x in np.ndindex(HEIGHT * GRID, WIDTH * GRID):
         here, means, halves, variances, follows = index_of(x, y), [], [], [], True
+        folded, shifts, spreads = False, [], []
         for axis, (dx, dy) in enumerate(((1, 0), (0, 1))):
             steps, paths, gains = [], [], []
+            slope = float(cells[1 + axis][here]) / GRID
+            shift, spread = 0.0, slope**2 / 12
             for sign in (1, -1):
                 u, v = x + sign * dx, y + sign * dy
                 same = 0 <= u < WIDTH * GRID and 0 <= v < HEIGHT * GRID
@@ -136,10 +157,17 @@ def test_first_cells_are_compared_with_their_neighbours(seed: int, whole: bool, 
                 cut[here] |= differ and energy * contrast >= LEAST
                 mixed[here] |= within and differ and apart
                 shining[here] |= glint / GRID**2 >= LEAST
+                fold = fold_of(slope * sign, float(cells[1 + axis][other]) / GRID * sign, step_of(cells, here, other))
+                hits = cells.flags[here] & cells.flags[other] & HIT
+                if fold and hits and not is_severed(cells, *pair, (dx / GRID, dy / GRID)):
+                    folded, (shift, spread) = True, fold
+                    follows &= joined
                 if joined:
                     steps.append(float(cells.distance_m[pair[1]]) - float(cells.distance_m[pair[0]]))
                     paths.append(float(filter_octaves[0][pair[1]]) - float(filter_octaves[0][pair[0]]))
                     gains.append(float(cells.radiance[pair[1]]) - float(cells.radiance[pair[0]]))
+            shifts.append(shift)
+            spreads.append(spread)
             if not steps:
                 follows = False
                 continue
@@ -154,13 +182,19 @@ def test_first_cells_are_compared_with_their_neighbours(seed: int, whole: bool, 
             variances.append(slope**2 / 4 + curve**2 / 240)
         follows &= cells.flags[here] & (HIT | LARGE) == HIT and cells.radiance[here] > 0
         expected = [span[here] for span in filter_octaves]
+        steepest = math.hypot(*(float(cells[1 + axis][here]) for axis in range(2))) / GRID
+        ratio = 2 * float(filter_octaves[1][here]) / max(steepest, 1e-9)
+        if folded and cells.flags[here] & (HIT | LARGE) == HIT and ratio < FOLD_RATIO and not follows:
+            turned += 1
+            spans = [ratio * math.sqrt(3 * spread) for spread in spreads]
+            expected = [expected[0] + ratio * sum(shifts), math.hypot(*spans), min(spans)]
         if follows:
             followed += 1
             expected = [filter_octaves[0][here] + sum(means), math.sqrt(sum(variances)), min(halves)]
         assert np.allclose([path[here], half[here], minor[here]], expected, rtol=1e-5, atol=1e-6)
     assert np.array_equal((bits & CUT) != 0, cut) and np.array_equal((bits & MIXED) != 0, mixed)
     assert np.array_equal((bits & GLINT) != 0, shining) and (0 < shining.sum() < COUNT) == glossy
-    assert followed > 0 and 10 < cut.sum() < COUNT and mixed.any()
+    assert followed > 0 and turned > 10 and 10 < cut.sum() < COUNT and mixed.any()
 
 
 @pytest.mark.parametrize("glossy", [False, True], ids=["paint", "polished"])
