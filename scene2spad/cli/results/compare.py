@@ -23,7 +23,7 @@ class Compare(Common):
     file: Positional[GivenFile]
     """A histogram written by `sense` (.h5), its counts as `export` wrote them (.npz, .h5), or a frame or capture of the
     published family (.mat)."""
-    methods: tuple[str, ...] = ("argmax", "log-matched", "fourier-16", "learned-1024x2x2-128x-t12-mixed-s9")
+    methods: tuple[str, ...] = ("argmax", "log-matched", "fourier-16", "learned-1024x2x2-128x-t12-mixed-s13")
     """Estimators of `depth`, codes with their number (fourier-16), codes of your own (K, T) in a file (.npy, or .txt
     as `export` writes it), names of networks (see `models`) or their checkpoints."""
     frame: int = 0

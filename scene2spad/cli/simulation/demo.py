@@ -14,7 +14,7 @@ from scenes.errors import InputError
 from scenes.library.catalog import load_scene
 from scenes.progress import Progress
 
-NETWORK = "learned-1024x2x2-128x-t12-mixed-s9"
+NETWORK = "learned-1024x2x2-128x-t12-mixed-s13"
 METHODS = {
     "argmax, all bins": "argmax",
     "log-matched, all bins": "log-matched",
