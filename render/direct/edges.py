@@ -124,18 +124,7 @@ def _seen(cells: Cells) -> tuple[Array, ...]:
 @recorded
 def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple, least: Floats) -> tuple[Array, ...]:
     cells, (path, half, minor), (grid, width, pixels) = Cells(*cells), path_intervals, counts
-    per_pixel = grid * grid
-    rank, place = divided(lane, per_pixel)
-    row, column = divided(place, grid)
-    whole = width > 0
-    _, pixel_x = divided(rank, dr.maximum(width, 1))
-    # after and before along x, then y: whether the neighbour is of the same pixel, whether of another, and which it is
-    sides = (
-        (column + 1 < grid, whole & (pixel_x + 1 < width), lane + 1, lane + per_pixel + 1 - grid),
-        (column > 0, whole & (pixel_x > 0), lane - 1, lane - per_pixel - 1 + grid),
-        (row + 1 < grid, whole & (rank + width < pixels), lane + grid, lane + per_pixel * width + grid - per_pixel),
-        (row > 0, whole & (rank >= width), lane - grid, lane - per_pixel * width - grid + per_pixel),
-    )
+    sides = _sides(lane, grid, width, pixels)
     pitch = dr.rcp(Float(grid))
     follows = ((cells.flags & (HIT | LARGE)) == HIT) & (cells.radiance > 0)
     per_radiance = dr.select(follows, dr.rcp(cells.radiance), 0)
@@ -185,6 +174,22 @@ def _first_edges(cells: tuple, path_intervals: tuple, lane: UInts, counts: tuple
         dr.select(follows, mean, path),
         dr.select(follows, dr.sqrt(variance), half),
         dr.select(follows, dr.minimum(*halves), minor),
+    )
+
+
+def _sides(lane: UInts, grid: UInts, width: UInts, pixels: UInts) -> tuple[tuple, ...]:
+    """Find the neighbours of first cells, after and before along x, then y: whether each is of the same pixel, whether
+    of another, and which it is in either case."""
+    per_pixel = grid * grid
+    rank, place = divided(lane, per_pixel)
+    row, column = divided(place, grid)
+    whole = width > 0
+    _, pixel_x = divided(rank, dr.maximum(width, 1))
+    return (
+        (column + 1 < grid, whole & (pixel_x + 1 < width), lane + 1, lane + per_pixel + 1 - grid),
+        (column > 0, whole & (pixel_x > 0), lane - 1, lane - per_pixel - 1 + grid),
+        (row + 1 < grid, whole & (rank + width < pixels), lane + grid, lane + per_pixel * width + grid - per_pixel),
+        (row > 0, whole & (rank >= width), lane - grid, lane - per_pixel * width - grid + per_pixel),
     )
 
 
