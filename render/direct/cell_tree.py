@@ -7,7 +7,20 @@ import math
 import numpy as np
 
 from render.direct.children import EdgePairs, Tree, child_edges
-from render.direct.edges import CUT, GLINT, HIGHLIGHT, MIXED, SURFACE, Cells, Place, Table, first_edges
+from render.direct.edges import (
+    COLUMN,
+    CUT,
+    GLINT,
+    HIGHLIGHT,
+    LEVEL,
+    MIXED,
+    PIXEL,
+    ROW,
+    SURFACE,
+    Cells,
+    Table,
+    first_edges,
+)
 from render.direct.footprints import CLIPPED, LARGE, Footprints, trace
 from render.scene.traced_scene import TracedScene, aligned
 
@@ -23,8 +36,6 @@ MAX_LAUNCHES = 256
 PASS_CELLS = 400
 LAST_FRACTIONS = 1 / 32, 1 / 8
 
-# columns of tables
-PIXEL, LEVEL, COLUMN, ROW = range(len(Place._fields))
 RADIANCE = SURFACE.index("radiance")
 # a cut cell's children, in the order of their rows: by how much level, column and row differ from twice the cell's
 _CHILDREN = np.array([(0, 1, 0, 0), (0, 1, 1, 0), (0, 1, 0, 1), (0, 1, 1, 1)], np.int32)

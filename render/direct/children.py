@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from render.backend.drjit_types import Array, Floats, Masks, UInts
-from render.direct.edges import CUT, Cells, Place, Table, bits_of, compare, divided
+from render.direct.edges import CUT, LEVEL, Cells, Table, bits_of, compare, divided
 from render.direct.footprints import LARGE, ray_offset
 from render.scene.rows import gather_rows
 from render.scene.traced_scene import Bool, Float, UInt32, dr, mi, recorded, upload
@@ -18,7 +18,6 @@ SIDES = 4  # of a cut cell: at each two children meet one another and what lies 
 OFFSET_SHARE = 0.5
 # Edges are placed where that moves more than this share of the energy that an edge must have to be worth its rays.
 WORTH_PLACING = 1 / 32
-LEVEL = Place._fields.index("level")
 # the first of the two children at each side, and how much later the other one comes
 _NEAR, _NEXT = np.array([0, 1, 0, 2]), np.array([2, 2, 1, 1])
 

@@ -60,6 +60,9 @@ class Place(NamedTuple):
     row: UInts
 
 
+PIXEL, LEVEL, COLUMN, ROW = range(len(Place._fields))
+
+
 class Table(NamedTuple):
     """Cells by row: children are compared with cells from all over a tree, and a row lies in one place in memory.
 

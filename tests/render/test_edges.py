@@ -82,7 +82,7 @@ def step_of(cells: Cells, a: int, b: int) -> float:
 
 
 def fold_of(slope: float, other_slope: float, step: float) -> tuple[float, float] | None:
-    """Mean off the centre's and variance of 4,000 distances across a cell that a crease crosses."""
+    """Compute mean off the centre's and variance of 4,000 distances across a cell that a crease crosses."""
     if abs(slope - other_slope) <= FOLD * max(abs(slope), abs(other_slope)):
         return None
     crease = (step - other_slope) / (slope - other_slope)
@@ -94,12 +94,12 @@ def fold_of(slope: float, other_slope: float, step: float) -> tuple[float, float
 
 
 def is_severed(cells: Cells, a: int, b: int, way: tuple[float, float]) -> bool:
-    """One of both is nothing or in shadow, or their planes do not explain the step between them."""
+    """Tell whether one of both is nothing or in shadow, or their planes do not explain the step between them."""
     return bool((cells.flags[a] ^ cells.flags[b]) & (HIT | LIT)) or gap_of(cells, a, b, way) > STEP_M
 
 
 def gap_of(cells: Cells, a: int, b: int, way: tuple[float, float]) -> float:
-    """How far the step between two hits is beyond what both planes predict."""
+    """Measure how far the step between two hits is beyond what both planes predict."""
     if not cells.flags[a] & cells.flags[b] & HIT:
         return 0.0
     step, rises = step_of(cells, a, b), rises_of(cells, a, b, way)
@@ -262,7 +262,7 @@ def bits_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid:
 
 
 def area_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid: int) -> float:
-    """Area of the second cell on the first one's side of the middle between their rays, 0 if it is not to be placed."""
+    """Compute how much of the second cell is on the first one's side of the middle between their rays; 0: not placed."""
     if places[0].pixel != places[1].pixel:
         return 0.0
     widths = [1 / (grid * 2**place.level) for place in places]
@@ -281,7 +281,7 @@ def area_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid:
 
 
 def ray_offset_of(place: Place, axis: int, grid: int) -> float:
-    """Offset of a cell's ray along an axis in cell widths: golden turns by its row (along x) or column (along y)."""
+    """Compute a ray's offset along an axis in cell widths: golden turns by its row (along x) or column (along y)."""
     number = place.row if axis == 0 else place.column
     golden = PLAIN_GOLDEN / 2**32
     if place.level > 0:

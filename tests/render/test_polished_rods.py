@@ -16,7 +16,7 @@ ROD, WALL = range(2)
 
 
 def rods() -> Scene:
-    """Rods a quarter of a pixel wide, 1.37 pixels apart and more or less aslant, before a white wall."""
+    """Build rods a quarter of a pixel wide, 1.37 pixels apart and more or less aslant, before a white wall."""
     surfaces = []
     for number in range(NUMBER):
         x = 1.37 * (number - NUMBER / 2 + 0.31) * ROD_M / VIEW.focal_px
@@ -45,13 +45,13 @@ def world() -> TracedScene:
 
 @pytest.fixture(scope="module")
 def expected(world: TracedScene) -> np.ndarray:
-    """Light of 2,304 cells a pixel and more: edges and highlights of 8 times finer cells than below."""
+    """Sum the light of 48 x 48 cells a pixel and more, 6 to 12 times finer than those below."""
     return light(world, 48, 0.01)
 
 
 @pytest.mark.parametrize("grid", [4, 5, 6, 8])
 def test_rods_and_wall_keep_their_light(world: TracedScene, expected: np.ndarray, grid: int) -> None:
-    """Cells on rods are finer than those on the wall: an edge between both is no nearer to the rods by that.
+    """Compare with fine cells: cells on rods are finer than those on the wall, and edges are no nearer to rods by that.
 
     Highlights are cut whether rays met their middle or not: with 6 and 8 cells a side they were 1 to 2 % too dark.
     """
@@ -64,6 +64,6 @@ def test_rods_and_wall_keep_their_light(world: TracedScene, expected: np.ndarray
 def test_edges_where_cells_meet_give_the_wall_too_much(
     world: TracedScene, expected: np.ndarray, grid: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What `CellTree.place_edges` is for: without it the wall has 1 to 2 % of the rods' places."""
+    """Check that the wall has 1 to 2 % too much without `CellTree.place_edges`."""
     monkeypatch.setattr(CellTree, "place_edges", lambda tree: None)
     assert (light(world, grid) / expected - 1)[WALL] > 0.007
