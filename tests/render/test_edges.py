@@ -262,7 +262,7 @@ def bits_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid:
 
 
 def area_of_pair(cells: Cells, pair: tuple[int, int], places: list[Place], grid: int) -> float:
-    """Compute how much of the second cell is on the first one's side of the middle between their rays; 0: not placed."""
+    """Compute how much of the second cell is on the first one's side of the middle between both rays; 0: not placed."""
     if places[0].pixel != places[1].pixel:
         return 0.0
     widths = [1 / (grid * 2**place.level) for place in places]
